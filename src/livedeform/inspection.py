@@ -17,7 +17,7 @@ from livedeform.common.bags.recording import Recording, header_stamp_ns, load_re
 from livedeform.common.bags.types import RawMessage, decode
 from livedeform.common.checks.finding import Finding, Severity
 from livedeform.common.checks.protocol import ProtocolStep, protocol
-from livedeform.common.checks.recorded import check_recording
+from livedeform.common.checks.recorded import check_named, check_recording
 from livedeform.common.errors import CalibrationError, InputError, MeshError, RecordingError
 from livedeform.common.experiment.plausibility import TETRAHEDRON_VOLUME, read_body
 from livedeform.common.experiment.schema import Markers
@@ -131,7 +131,7 @@ def fit_findings(bag: BagReader, experiment: Experiment, recording: Recording) -
     if wrong:  # nothing more can be read
         return wrong
     acting = experiment.of_recording(recording.own_name)
-    return [*_Fit(bag, acting).findings(), *check_recording(recording, acting)]
+    return [*_Fit(bag, acting).findings(), *check_named(recording, acting), *check_recording(recording, acting)]
 
 
 class _Tracks:

@@ -37,6 +37,19 @@ def check_recording(recording: Recording, experiment: Experiment) -> list[Findin
     return [finding for check in checks for finding in check(recording, experiment, body)]
 
 
+def check_named(recording: Recording, experiment: Experiment) -> list[Finding]:
+    """Say what lines of ``recordings`` declare of it; where there are lines and none fits, one may be mistyped."""
+    if not experiment.recordings:
+        return []
+    if said := experiment.overrides(recording.own_name):
+        text = "; ".join(override.text for override in said)
+        return [Finding("NOTE", f"declared of '{recording.own_name}' alone: {text}")]
+    named = list(experiment.recordings)
+    shown = ", ".join(named[:4]) + (f" and {len(named) - 4} more" if len(named) > 4 else "")
+    text = f"no line of recordings ({shown}) fits '{recording.own_name}': what is declared for all acts in it"
+    return [Finding("WARN", text, "correct the line's name, if one is meant for it")]
+
+
 def frames_of(recording: Recording) -> list[MarkerFrame]:
     """The measured frames, as they were before any correction."""
     return recording.uncorrected_marker_frames or recording.marker_frames
@@ -210,7 +223,8 @@ def load_checked(fit: Sequence[Path], test: Sequence[Path], experiment: Experime
                 "and not which point went where",
                 where=str(path), remedy="paint some markers, or import points with ids",
             )  # fmt: skip
-        findings = check_recording(recording, experiment.of_recording(recording.own_name))
+        acting = experiment.of_recording(recording.own_name)
+        findings = [*check_named(recording, experiment), *check_recording(recording, acting)]
         refuse_errors(findings, str(path))
         said = [finding.text for finding in findings if finding.level == "WARN"]
         loaded.append(replace(recording, warnings=[*recording.warnings, *said]))

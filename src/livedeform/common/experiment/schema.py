@@ -687,6 +687,14 @@ def _each_once(effects: tuple[EffectValues, ...]) -> tuple[EffectValues, ...]:
     return effects
 
 
+def _named(recordings: dict[str, Override]) -> dict[str, Override]:
+    """Refuse a name that no recording can have: a name is no path."""
+    for pattern in recordings:
+        if "/" in pattern:
+            raise problem(f"'{pattern}' is a path", "write the recording's own name, without its folders")
+    return recordings
+
+
 Effect = Annotated[
     EffectValues,
     BeforeValidator(_read_effect),
@@ -729,9 +737,9 @@ class Experiment(Section):
     """Forces that act besides the body's weight."""
     timeline: Timeline = Timeline()
     """When gravity and loads begin to act."""
-    recordings: dict[str, Override] = {}
+    recordings: Annotated[dict[str, Override], AfterValidator(_named)] = {}
     """What acts otherwise in some recordings: {NAME or GLOB: {loads: [..], gravity: [..], release: s}}. A recording's
-    name is its file's without .mcap, or its folder's; of several that fit, the later line decides."""
+    name is its file's, with or without .mcap, or its folder's; of several that fit, the later line decides."""
     temperature: Temperature | None = None
     """How warm the body is over time; needed for thermal_expansion."""
     effects: Annotated[tuple[Effect, ...], AfterValidator(_each_once)] = ()
@@ -797,10 +805,13 @@ class Experiment(Section):
     def of_recording(self, name: str) -> Experiment:
         """The same experiment with what acts in the recording of that name declared for all."""
         out = self
-        for pattern, override in self.recordings.items():
-            if fnmatchcase(name, pattern):
-                out = out.under(override)
+        for override in self.overrides(name):
+            out = out.under(override)
         return out
+
+    def overrides(self, name: str) -> list[Override]:
+        """What is said of the recording of that name, the last to decide last; empty where no line fits it."""
+        return [said for key, said in self.recordings.items() if fnmatchcase(name, key.removesuffix(".mcap"))]
 
     @property
     def acting(self) -> Override:
