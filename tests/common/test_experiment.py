@@ -310,6 +310,38 @@ def test_markers_on_the_table_may_be_farther_off(folder):
     load_experiment(folder)
 
 
+@pytest.mark.parametrize("header", ["id,x,y,z,kind", "ID, X, Y, Z, Kind", "# one kind\n\nkind,id,x,y,z", "id,x,y,z"])
+def test_whether_kinds_are_stated_is_told_by_the_columns(folder, header):
+    row = "internal,1,0,0,0.02" if "kind,id" in header else "1,0,0,0.02,internal"
+    row = row.removesuffix(",internal") if header == "id,x,y,z" else row
+    (folder / "markers.csv").write_text(f"# measured by hand, no kind\n{header}\n{row}\n")
+    markers = load_experiment(folder).markers
+    assert markers.kinds_stated == ("kind" in header.lower().splitlines()[-1])
+    assert markers.kinds.tolist() == ["internal" if markers.kinds_stated else "surface"]
+
+
+@pytest.mark.parametrize(
+    ("name", "wanted"), [("kinds", "kind"), ("Knid", "kind"), ("sigmas", "sigma"), ("sgima", "sigma")]
+)
+def test_a_mistyped_column_is_not_left_out_in_silence(folder, name, wanted):
+    (folder / "markers.csv").write_text(f"id,x,y,z,{name}\n1,0,0,0.02,\n")
+    assert f"a column '{name.strip()}' is not read; call it {wanted}" in complaint(folder)
+
+
+@pytest.mark.parametrize("name", ["sigma_x", "note", "X", "find", "type"])
+def test_other_columns_are_left_out(folder, name):
+    (folder / "markers.csv").write_text(f"id,x,y,z,{name}\n1,0,0,0.05,what\n")
+    assert load_experiment(folder).markers.ids.tolist() == [1]
+
+
+def test_a_mistake_in_the_markers_has_its_own_line(folder):
+    """Comments and empty lines count, too."""
+    for row, says in (("2,0,up,0.02", "y is 'up'"), ("1,0,0,0.05", "marker id 1 is there twice"), ("2,1", "y is ''")):
+        (folder / "markers.csv").write_text(f"# by hand\nid,x,y,z\n\n1,0,0,0.05\n# the second\n{row}\n")
+        line = complaint(folder)
+        assert "markers.csv:6: " in line and says in line
+
+
 def test_an_unknown_kind_of_marker(folder):
     (folder / "markers.csv").write_text("id,x,y,z,kind\n1,0,0,0.05,deep\n")
     assert "unknown kind 'deep'" in complaint(folder)

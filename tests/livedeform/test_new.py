@@ -129,6 +129,19 @@ def test_a_table_s_unit_is_told_wherever_markers_are_on_the_body(block: Path, of
     np.testing.assert_allclose(found.points, 1e-3 * places, atol=1e-8)
 
 
+@pytest.mark.parametrize("comment", ["", "# measured 12 May\n", "# one kind of marker: beads\n\n"])
+@pytest.mark.parametrize("stated", [True, False])
+def test_kinds_are_those_of_the_table_whatever_comments_it_has(block: Path, comment: str, stated: bool) -> None:
+    """A comment above the header hid the column of kinds, and one about kinds was taken for it."""
+    rows = ["id,x,y,z,kind", "1,0,0,20,surface", "2,0,0,48,internal", "3,40,0,0,surface", "4,30,0,20,surface"]
+    table = rows if stated else [row.rpartition(",")[0] for row in rows]
+    (block / "table.csv").write_text(comment + "\n".join(table))
+    body = read_new_body(block / "block.stl", "mm")
+    found = read_places(block / "table.csv", body.surface, unit="mm", rest=(0.0, 1.0), places={})
+    told, guessed = ["surface", "internal", "surface", "surface"], ["internal", "surface", "support", "surface"]
+    assert found.kinds.tolist() == (told if stated else guessed)
+
+
 def test_markers_of_a_recording_at_rest(block: Path) -> None:
     """In the tracker's frame, 0.5 m away: three stated places take them to the surface's."""
     table = np.array([[0.0, 0.0, 0.05], [0.03, 0.0, 0.02], [0.0, 0.03, 0.02], [-0.03, 0.0, 0.02]])

@@ -27,7 +27,7 @@ BAG_SUFFIXES = (".mcap", ".db3", "")
 
 @dataclass(frozen=True)
 class RestMarkers:
-    """Markers before they are checked: ``stated`` tells which have a kind in the file; ``note`` how they came."""
+    """Markers before they are checked: ``kinds`` is empty where the file states none; ``note`` says how they came."""
 
     ids: Ids
     points: Array
@@ -70,8 +70,7 @@ def _in_metres(file: Path, surface: Surface, unit: str | None) -> RestMarkers:
     near = REACH * float(np.linalg.norm(surface.upper - surface.lower))
     chosen = unit or ("m" if off["m"] <= near else min(off, key=lambda u: off[u]))
     factor = {"m": 1.0, "mm": 1e-3}[chosen]
-    stated = "kind" in file.read_text(encoding="utf-8-sig").splitlines()[0]
-    kinds = tuple(str(kind) for kind in read.kinds) if stated else ()
+    kinds = tuple(str(kind) for kind in read.kinds) if read.kinds_stated else ()
     note = f"{len(read.ids)} markers of {file.name}, in {chosen}"
     return RestMarkers(read.ids, read.points * factor, read.sigmas * factor, kinds, note)
 

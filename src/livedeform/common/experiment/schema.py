@@ -711,13 +711,14 @@ class Markers:
     """Reference markers, in the surface file's configuration.
 
     ``ids`` (n,); ``points`` (n, 3) m; ``sigmas`` (n,) m, NaN where the file gives none; ``kinds`` (n,) surface,
-    internal or support ("surface" where the file gives none).
+    internal or support ("surface" where the file gives none); ``kinds_stated``: it has a column of kinds.
     """
 
     ids: Ids
     points: Array
     sigmas: Array
     kinds: NDArray[np.str_]
+    kinds_stated: bool = False
 
 
 class Experiment(Section):
