@@ -15,6 +15,7 @@ from livedeform.common.bags.pictures import read_camera_info
 from livedeform.common.bags.read import BagReader, read_bag
 from livedeform.common.bags.recording import Recording, header_stamp_ns, load_recording, to_image
 from livedeform.common.bags.types import RawMessage, decode
+from livedeform.common.checks.declared import check_declared
 from livedeform.common.checks.finding import Finding, Severity
 from livedeform.common.checks.protocol import ProtocolStep, protocol
 from livedeform.common.checks.recorded import check_named, check_recording
@@ -341,7 +342,7 @@ def inspect_experiment(path: Path) -> Report:
         "effects": ", ".join(effect.name for effect in experiment.effects) or "none",
         "verdict at": f"{1e3 * experiment.thresholds.error:g} mm",
     }
-    findings = _body_findings(experiment) + _calibration_findings(experiment)
+    findings = _body_findings(experiment) + check_declared(experiment, body) + _calibration_findings(experiment)
     if experiment.stereo is not None:
         findings += _detector_findings(experiment)
     if 0 < len(markers.ids) < 3:

@@ -11,6 +11,7 @@ import numpy as np
 
 from livedeform.common import topics as t
 from livedeform.common.bags.recording import Recording, load_recording
+from livedeform.common.checks.declared import check_declared
 from livedeform.common.checks.exchanged import check_exchanged
 from livedeform.common.checks.finding import Finding, Severity, refuse_errors
 from livedeform.common.checks.probe_path import check_probe
@@ -28,13 +29,14 @@ SAME = 0.5  # share of equal poses from which two recordings are one
 
 
 def check_recording(recording: Recording, experiment: Experiment) -> list[Finding]:
-    """Everything that can be told from the recording's numbers, without its pictures."""
+    """Everything that can be told from the recording's numbers, without its pictures, and of what is declared."""
     body = read_body(experiment)
     checks: Sequence[Callable[[Recording, Experiment, Surface], list[Finding]]] = (
         check_faults, check_ids, check_inputs, check_stamps, check_gaps, check_places, check_exchanges,
         check_probe, check_release, check_drifts,
     )  # fmt: skip
-    return [finding for check in checks for finding in check(recording, experiment, body)]
+    found = [finding for check in checks for finding in check(recording, experiment, body)]
+    return [*found, *check_declared(experiment, body)]
 
 
 def check_named(recording: Recording, experiment: Experiment) -> list[Finding]:

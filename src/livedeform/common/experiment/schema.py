@@ -764,6 +764,11 @@ class Experiment(Section):
                 f"'{parameter}' of effect '{name}' acts only where a body is let go",
                 "leave it out, or give timeline.release",
             )
+        if self.temperature is None and any(effect.name == "thermal_expansion" for effect in self.effects):
+            raise problem(
+                "effect 'thermal_expansion' needs to know how warm the body was",
+                "declare 'temperature', or leave the effect out",
+            )
         return self
 
     @property
