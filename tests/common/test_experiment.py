@@ -177,6 +177,12 @@ MISTAKES = [
     ("phantom.support.0.region", {"below_z": -0.01}, "touches no part of the body", "correct"),
     ("phantom.support.0.region", {"below_z": 0.01, "above_z": 0.02}, "below_z and above_z", "one of"),
     ("phantom.support.0.region", {}, "here is nothing", "one of"),
+    (
+        "phantom.support.0.region",
+        {"box": [[-0.01, -0.01, 0.02], [0.01, 0.01, 0.03]]},
+        "lies inside its surface",
+        "correct",
+    ),
     ("phantom.support.0.region", {"sphere": {"centre": [0.2, 0, 0], "radius": 0.01}}, "touches no part", ""),
     ("phantom.support.0.region", {"box": [[0, 0, 0], [0, 1, 1]]}, "first corner", ""),
     ("phantom.support.0.type", "glued", "phantom.support.0.type", ""),

@@ -91,15 +91,37 @@ def test_without_a_terminal_every_missing_option_is_named_at_once(block: Path) -
         ({"modulus": "-4"}, "not positive"),
         ({"gravity": "9.81"}, "three numbers"),
         ({"cameras": "left.yaml"}, "does not exist"),
-        ({"support_below": "0.5"}, "whole body"),
-        ({"modulus": "4"}, "pascals"),
+        ({"support_below": "0.5"}, "--support-below: the region holds the whole body"),
+        ({"modulus": "4"}, "--modulus: .* pascals"),
+        ({"density": "1"}, "--density: 1 is not plausible"),
+        ({"poisson": "0.5"}, "--poisson: .* below 0.5"),
+        ({"gravity": "0,0,-981"}, "--gravity: "),
+        ({"element_size": "1e-5"}, "--element-size: .* tetrahedra"),
+        ({"friction": "20"}, "--friction: 20 is not plausible"),
+        ({"probe": "cylinder:0.01,0.1", "edge_radius": "0.2"}, "--edge-radius: "),
+        ({"probe": "ball:2"}, "--probe: sphere is 2 m"),
+        ({"threshold": "2"}, "--threshold: error is 2 m"),
     ],
 )
 def test_a_wrong_answer_is_one_line(block: Path, change: dict[str, str], said: str) -> None:
     with pytest.raises(InputError, match=said) as caught:
         make_experiment(block / "new", sources(block), KNOWN | change)
-    assert "\n" not in str(caught.value) and caught.value.remedy
+    assert "\n" not in str(caught.value) and caught.value.remedy and "draft" not in str(caught.value)
     assert not (block / "new").exists()
+
+
+def test_what_is_made_is_as_sound_as_info_says(block: Path) -> None:
+    """Calibrations that are none were copied, and the folder called sound."""
+    for side in ("l.yaml", "r.yaml"):
+        (block / side).write_text("abc")
+    cameras = {"cameras": f"{block / 'l.yaml'},{block / 'r.yaml'}"}
+    with pytest.raises(InputError, match=rf"{block / 'l.yaml'}: holds no keys"):
+        make_experiment(block / "new", sources(block), KNOWN | cameras)
+    assert not (block / "new").exists()
+    lines = make_experiment(block / "new", sources(block), KNOWN | {"modulus": "25"})
+    told = [f"warning: {f.text}" for f in inspect(block / "new").findings if f.level == "WARN"]
+    assert len(told) == 1 and "collapses" in told[0]
+    assert [line.partition(";")[0] for line in lines if line.startswith("warning: ")] == told
 
 
 def test_a_unit_that_cannot_be_told_is_asked_for(tmp_path: Path) -> None:

@@ -14,6 +14,7 @@ from livedeform.common.experiment.markers_file import write_markers
 from livedeform.common.experiment.yaml_file import FILE_NAME, json_schema, load_experiment
 from livedeform.common.types import Array
 from livedeform.new.body import read_new_body
+from livedeform.new.inspected import inspected
 from livedeform.new.markers import fit_note, read_places
 from livedeform.new.picture import draw
 from livedeform.new.questions import Answers, Ask, answered, questions
@@ -71,14 +72,15 @@ def make_experiment(
         write_markers(draft / MARKERS, markers)
         write_text(draft / FILE_NAME, text)
         write_json(draft / SCHEMA, json_schema())
-        experiment = load_experiment(draft)
+        findings = inspected(draft, {**{name: file for file, name in copies.items()}, MARKERS: sources.markers})
         tell("drawing the body")
-        draw(experiment, draft / PICTURE)
+        draw(load_experiment(draft), draft / PICTURE)
     size = " x ".join(f"{1e3 * s:.1f}" for s in body.size)
     return [
         f"body: {size} mm, the surface file is in {body.unit}",
         f"markers: {fit_note(markers, body.surface)}",
         *([f"assumed: {'; '.join(answers.assumed)}"] if answers.assumed else []),
+        *findings,
         f"{out / FILE_NAME}: sound; {out / PICTURE} shows it",
     ]
 

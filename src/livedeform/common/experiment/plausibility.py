@@ -18,6 +18,7 @@ SUPPORT_REACH = 10.0  # markers on the support may be that much farther off
 TIMES_THE_BODY, LARGEST_BESIDE = 5.0, 0.5  # of the diagonal, m: plates are larger than what they press, and tools long
 LARGEST_FITTED = 0.1  # m; up to here a fit may make a region larger than a small body
 WITHIN, OUTSIDE = {"radius", "thickness"}, {"translation"}  # parameters of effects that are lengths, m
+NEXT_TO = 0.01  # of the diagonal: a box so near to the surface may meet the mesh's
 TETRAHEDRON_VOLUME = 1.0 / (6.0 * np.sqrt(2.0))  # of a regular one with edge 1
 
 
@@ -208,7 +209,7 @@ def _refuse_length(where: str, name: str, length: float, surface: Surface) -> No
 
 
 def _check_region(experiment: Experiment, surface: Surface, region: Region, key: str) -> None:
-    """Refuses a region that the surface cannot reach; what it selects of the mesh is the solver's to check."""
+    """Refuses a region that the surface does not reach; what it selects of the mesh is the solver's to check."""
     z_min, z_max = surface.lower[2], surface.upper[2]
     if region.below_z is not None:
         misses, body = region.below_z < z_min, f"the body's lowest point is at z = {z_min:.4g}"
@@ -216,8 +217,11 @@ def _check_region(experiment: Experiment, surface: Surface, region: Region, key:
         misses, body = region.above_z > z_max, f"the body's highest point is at z = {z_max:.4g}"
     elif region.box is not None:
         lower, upper = np.array(region.box)
+        slack = NEXT_TO * _across(surface)
         misses = bool((lower > surface.upper).any() or (upper < surface.lower).any())
         body = f"the body lies between {_point(surface.lower)} and {_point(surface.upper)}"
+        if not misses and not surface.meets_box(lower - slack, upper + slack):
+            misses, body = True, f"the box lies inside its surface, or beside it, by more than {slack:.2g}"
     elif region.sphere is not None:
         away = float(surface.distance(np.array([region.sphere.centre]))[0])
         misses, body = away > region.sphere.radius, f"the surface is {away:.3g} m from its centre"
@@ -229,7 +233,9 @@ def _check_region(experiment: Experiment, surface: Surface, region: Region, key:
         body = f"the body is {np.abs(heights).min():.3g} m from the plane"
     if misses:
         raise InputError(
-            f"the region touches no part of the body: {body} m", where=_where(experiment, key), remedy="correct it"
+            f"the region touches no part of the body's surface: {body} m",
+            where=_where(experiment, key),
+            remedy="correct it",
         )
 
 
