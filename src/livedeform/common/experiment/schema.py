@@ -40,6 +40,7 @@ from livedeform.common.types import Array, EffectValues, Ids
 
 SIGMA = "_sigma"
 FLOAT_MAX = float(np.finfo(float).max)
+ABSOLUTE_ZERO, MOST_APART = -273.15, 200.0  # degrees; Celsius and kelvin beside each other are 273 apart
 DEFAULT_GRAVITY = (0.0, 0.0, -9.81)
 
 
@@ -606,16 +607,22 @@ class Temperature(Section):
         if listed == (self.file is not None) or (self.time is None) != (self.value is None):
             raise problem("a temperature is given by 'file', or by 'time' and 'value'", "give one of the two")
         if self.time is not None and self.value is not None:
-            check_curve(self.time, self.value)
+            check_curve(self.time, self.value, self.reference)
         return self
 
 
-def check_curve(time: Sequence[float], value: Sequence[float]) -> None:
-    """Raise a `problem` unless ``value`` is a curve over rising ``time``."""
+def check_curve(time: Sequence[float], value: Sequence[float], reference: float) -> None:
+    """Raise a `problem` unless ``value`` is a curve over rising ``time``, in the unit of ``reference``."""
     if len(time) != len(value) or not time:
         raise problem(f"{len(time)} times but {len(value)} temperatures", "give one temperature per time")
     if any(b <= a for a, b in pairwise(time)):
         raise problem("the times do not rise", "sort them, each once")
+    if min(*value, reference) < ABSOLUTE_ZERO:
+        raise problem(f"{min(*value, reference):g} degrees Celsius is below absolute zero", "correct the temperature")
+    apart = max(value, key=lambda degrees: abs(degrees - reference))
+    if abs(apart - reference) > MOST_APART:
+        what = f"a temperature of {apart:g} is {abs(apart - reference):g} degrees from the reference {reference:g}"
+        raise problem(what, "give all in degrees Celsius, or all in kelvin")
 
 
 class Thresholds(Section):
