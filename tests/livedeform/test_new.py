@@ -147,7 +147,7 @@ def test_a_table_s_unit_is_told_wherever_markers_are_on_the_body(block: Path, of
     rows = [f"{k},{','.join(f'{unit * x:.6f}' for x in place)}" for k, place in enumerate(places)]
     (block / "table.csv").write_text("\n".join(["id,x,y,z", *rows]))
     body = read_new_body(block / "block.stl", "mm")
-    found = read_places(block / "table.csv", body.surface, unit=None, rest=(0.0, 1.0), places={})
+    found, _ = read_places(block / "table.csv", body.surface, unit=None, rest=(0.0, 1.0), places={})
     np.testing.assert_allclose(found.points, 1e-3 * places, atol=1e-8)
 
 
@@ -159,7 +159,7 @@ def test_kinds_are_those_of_the_table_whatever_comments_it_has(block: Path, comm
     table = rows if stated else [row.rpartition(",")[0] for row in rows]
     (block / "table.csv").write_text(comment + "\n".join(table))
     body = read_new_body(block / "block.stl", "mm")
-    found = read_places(block / "table.csv", body.surface, unit="mm", rest=(0.0, 1.0), places={})
+    found, _ = read_places(block / "table.csv", body.surface, unit="mm", rest=(0.0, 1.0), places={})
     told, guessed = ["surface", "internal", "surface", "surface"], ["internal", "surface", "support", "surface"]
     assert found.kinds.tolist() == (told if stated else guessed)
 
@@ -179,6 +179,32 @@ def test_markers_of_a_recording_at_rest(block: Path) -> None:
     markers = load_experiment(block / "new").markers
     assert markers.ids.tolist() == [1, 2, 3, 4]
     np.testing.assert_allclose(markers.points, table[::-1], atol=1e-7)  # float32 of the recording
+
+
+def test_how_markers_came_is_told_and_places_that_contradict_them_are_refused(block: Path) -> None:
+    table = np.array([[0.0, 0.0, 0.05], [0.03, 0.0, 0.02], [0.0, 0.03, 0.02], [-0.03, 0.0, 0.02]])
+    with Writer(block / "a.mcap", begins="2026-03-01") as recording:
+        for frame in range(10):
+            recording.points(0.1 * frame, [1, 2, 3, 4], table + 0.5)
+    stated = ["1=0,0,0.05", "2=0.03,0,0.02", "3=0,0.03,0.021"]  # one is 1 mm off
+    lines = make_experiment(block / "new", sources(block, "a.mcap", places=read_places_of(stated)), KNOWN)
+    assert "4 markers of a.mcap at rest, moved to 3 stated places (misfit 0.30 mm rms)" in "\n".join(lines)  # measured
+    assert any(
+        "5 markers of table.csv, in mm" in line for line in make_experiment(block / "other", sources(block), KNOWN)
+    )
+    stated[0] = "1=0,0.012,0.045"
+    with pytest.raises(InputError, match=r"--place: the stated places are .* mm"):
+        make_experiment(block / "third", sources(block, "a.mcap", places=read_places_of(stated)), KNOWN)
+    assert not (block / "third").exists()
+
+
+@pytest.mark.parametrize("n", [1, 3, 4])
+def test_markers_in_another_frame_are_not_taken_for_millimetres(block: Path, n: int) -> None:
+    """Metres some 0.4 m beside the body were all put at its origin, as millimetres."""
+    rows = [f"{k},{0.28 + 0.02 * k},{0.3 + 0.01 * (k % 2)},0.35" for k in range(n)]
+    (block / "table.csv").write_text("\n".join(["id,x,y,z", *rows]))
+    with pytest.raises(InputError, match="mm from the body; the frames differ"):
+        make_experiment(block / "new", sources(block), KNOWN)
 
 
 def test_nothing_is_overwritten_without_force(block: Path) -> None:

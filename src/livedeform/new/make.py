@@ -56,7 +56,7 @@ def make_experiment(
     """
     tell("reading the surface and the markers")
     body = read_new_body(sources.surface, sources.surface_unit)
-    markers = read_places(
+    markers, note = read_places(
         sources.markers, body.surface, unit=sources.markers_unit, rest=sources.rest, places=sources.places or {}
     )
     answers = answered(questions(body, out), given, ask)
@@ -78,6 +78,7 @@ def make_experiment(
     size = " x ".join(f"{1e3 * s:.1f}" for s in body.size)
     return [
         f"body: {size} mm, the surface file is in {body.unit}",
+        f"read: {note}",
         f"markers: {fit_note(markers, body.surface)}",
         *([f"assumed: {'; '.join(answers.assumed)}"] if answers.assumed else []),
         *findings,
