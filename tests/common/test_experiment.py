@@ -103,6 +103,43 @@ thresholds: {error: 0.005}
     assert text != published
 
 
+@pytest.mark.parametrize(
+    ("text", "value"), [("4e3", 4000.0), ("4E3", 4000.0), ("+4.e3", 4000.0), ("'4000'", 4000.0), ("4_000", 4000.0)]
+)
+def test_a_number_may_be_written_in_any_way_with_its_companion_beside_it(folder, text, value):
+    """YAML 1.1 reads 4e3 as a text."""
+    written = (folder / "experiment.yaml").read_text()
+    new = written.replace("youngs_modulus: 4000.0,", f"youngs_modulus: {text}, youngs_modulus_sigma: 2e2,")
+    new = new.replace("effects: []", "effects: [{name: viscoelasticity, g: [3e-1], tau: [2e0], tau_sigma: [1e-1]}]")
+    new = new.replace("model: neo_hookean,", "model: yeoh, c2_ratio: 1e-1,")
+    new += "temperature: {time: [0, 1e2], value: [2e1, 21], reference: 2e1}\n"
+    (folder / "experiment.yaml").write_text(new)
+    experiment = load_experiment(folder)
+    material = experiment.phantom.material
+    assert material.youngs_modulus == value and experiment.sigma("phantom.material.youngs_modulus") == 200.0
+    assert material.parameters == {"c2_ratio": 0.1} and experiment.temperatures == ((0.0, 100.0), (20.0, 21.0))
+    assert experiment.effects[0].values["g"].tolist() == [0.3] and experiment.effects[0].sigmas["tau"].tolist() == [0.1]
+
+
+def test_a_name_may_look_like_a_number(change):
+    change("name", "4e3")
+    change("loads.0.name", "2e1")
+    experiment = load_experiment(change("timeline", {"clock_start_ns": "1700000000000000001"}))
+    assert (experiment.name, experiment.loads[0].name) == ("4e3", "2e1")
+    assert experiment.timeline.clock_start_ns == 1_700_000_000_000_000_001
+
+
+@pytest.mark.parametrize("text", ["04000", "-04000", "0_4000"])
+def test_a_number_with_a_leading_zero_is_not_read_to_the_base_8(folder, text):
+    document = (folder / "experiment.yaml").read_text()
+    (folder / "experiment.yaml").write_text(document.replace("youngs_modulus: 4000.0", f"youngs_modulus: {text}"))
+    line = complaint(folder)
+    assert f"experiment.yaml:10: {text} begins with a zero, and is read as 2048" in line
+    for same in ("0900.0", "'04000'", "4000"):  # no octal numbers
+        (folder / "experiment.yaml").write_text(document.replace("youngs_modulus: 4000.0", f"youngs_modulus: {same}"))
+        load_experiment(folder)
+
+
 def test_sigma_companions(change):
     change("phantom.material.youngs_modulus_sigma", 200.0)
     change("phantom.density_sigma", 5)

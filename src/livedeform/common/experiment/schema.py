@@ -7,6 +7,7 @@ physical quantity may have a companion ``<key>_sigma`` (one standard deviation),
 from __future__ import annotations
 
 import difflib
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
@@ -41,6 +42,8 @@ from livedeform.common.types import Array, EffectValues, Ids
 SIGMA = "_sigma"
 FLOAT_MAX = float(np.finfo(float).max)
 ABSOLUTE_ZERO, MOST_APART = -273.15, 200.0  # degrees; Celsius and kelvin beside each other are 273 apart
+LONGEST_STAMP = 30  # digits; no float holds those of a stamp in nanoseconds
+NUMBER = r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?"
 DEFAULT_GRAVITY = (0.0, 0.0, -9.81)
 
 
@@ -107,6 +110,16 @@ def _unit_quaternion(value: tuple[float, ...]) -> tuple[float, ...]:
     return value
 
 
+def as_number(value: Any) -> Any:
+    """Return the numbers that a text or a list of texts stands for, others as they are: 4e3 is a text in YAML 1.1."""
+    if isinstance(value, list | tuple):
+        return [as_number(item) for item in value]
+    if not isinstance(value, str) or not re.fullmatch(NUMBER, value):
+        return value
+    whole = value.lstrip("+-").isdigit() and len(value) < LONGEST_STAMP
+    return int(value) if whole else float(value)
+
+
 Number = Annotated[float, BeforeValidator(_not_bool), AllowInfNan(False)]
 Positive = Annotated[Number, Field(gt=0)]
 NonNegative = Annotated[Number, Field(ge=0)]
@@ -128,7 +141,7 @@ class Section(BaseModel):
     def _read(cls, data: Any, handler: ModelWrapValidatorHandler[Self]) -> Self:
         if not isinstance(data, Mapping):
             return handler(data)
-        values = dict(data)
+        values = {key: as_number(value) if cls._is_of_numbers(key) else value for key, value in data.items()}
         sigmas = {}
         for key in [k for k in values if isinstance(k, str) and k.endswith(SIGMA)]:
             if key.removesuffix(SIGMA) in cls._quantities(values):
@@ -140,6 +153,11 @@ class Section(BaseModel):
         section = handler(values)
         section._sigmas.update(sigmas)
         return section
+
+    @classmethod
+    def _is_of_numbers(cls, key: Any) -> bool:
+        """Return whether a key holds numbers: a field that does, a companion, or a setting of its own."""
+        return key not in cls.model_fields or "float" in str(cls.model_fields[key].annotation)
 
     @classmethod
     def _keys(cls) -> list[str]:
@@ -643,7 +661,7 @@ def _read_effect(value: Any, info: ValidationInfo) -> Any:
     if name not in known:
         raise problem(f"unknown effect '{name}'", did_you_mean(name, list(known)))
     sizes = {**known[name], **OPTIONAL_PARAMETERS.get(name, {})}
-    parameters = {k: v for k, v in value.items() if k != "name"}
+    parameters = {k: as_number(v) for k, v in value.items() if k != "name"}
     values: dict[str, Array] = {}
     sigmas: dict[str, Array] = {}
     for key, entry in parameters.items():
