@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ import trimesh
 from typer.testing import CliRunner
 
 from livedeform.cli import app, run
+from livedeform.commands.new import _asks
 from livedeform.common.errors import InputError
 from livedeform.common.experiment.probe_mesh import probe_mesh
 from livedeform.common.experiment.schema import Probe
@@ -19,6 +21,7 @@ from livedeform.new.body import read_new_body
 from livedeform.new.make import Sources, make_experiment, read_places_of
 from livedeform.new.markers import read_places
 from livedeform.new.questions import read_probe
+from livedeform.progress import Progress
 from livedeform.recording import Writer
 
 TABLE = "id,x,y,z\n1,0,0,50\n2,30,0,20\n5,0,30,20\n7,0,0,20\n9,40,0,0\n"  # mm; 7 inside, 9 beside the base
@@ -222,6 +225,57 @@ def test_the_command_and_the_view(block: Path) -> None:
     assert run(["view", str(block / "new"), "--no-open"]) == 0
     page = (block / "new" / "view.html").read_text()
     assert ("surface markers" in page and "Mesh3d" in page) or "mesh3d" in page
+
+
+@pytest.mark.parametrize("option", ["--unit", "--markers-unit"])
+def test_a_unit_that_nobody_knows_is_a_wrong_option(block: Path, option: str, capsys: pytest.CaptureFixture) -> None:
+    words = ["new", str(block / "new"), "--surface", str(block / "block.stl"), "--markers", str(block / "table.csv")]
+    assert run([*words, option, "cm"]) == 2
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1 and f"'{option}'" in said and "internal" not in said
+    known = ["--probe", "none", "--modulus", "4000", "--configuration", "loaded"]
+    assert run([*words, option, "mm", *known]) == 0
+
+
+@pytest.mark.parametrize(
+    "name", ["my # phantom", "phantom 😀", "a: b {c} 'd' \"e\"", "- \\ %", "tab\there\x7f", "007", "$\\frac$"]
+)
+def test_any_name_comes_back(block: Path, name: str) -> None:
+    (block / "table.csv").write_text(TABLE)
+    (block / "block.stl").rename(block / "my # block {1}.stl")
+    surface = Sources(block / "my # block {1}.stl", block / "table.csv")
+    trimesh.creation.box((0.02, 0.02, 0.02)).export(block / "a, # probe.stl")
+    probe = {"probe": f"mesh:{block / 'a, # probe.stl'}"}
+    make_experiment(block / "new", surface, KNOWN | probe | {"name": name})
+    experiment = load_experiment(block / "new")
+    assert experiment.name == name
+    assert experiment.phantom.surface == (block / "new" / "my # block {1}.stl").resolve()
+    assert experiment.probe is not None and experiment.probe.shape.mesh is not None
+    assert experiment.probe.shape.mesh.name == "a, # probe.stl"
+
+
+def test_nothing_is_asked_where_nothing_may_be_written(block: Path) -> None:
+    make_experiment(block / "new", sources(block), KNOWN)
+    with pytest.raises(InputError, match="there are results already"):
+        make_experiment(block / "new", sources(block), {}, ask=lambda question, default: pytest.fail("it asked"))
+
+
+def test_the_progress_bar_is_away_while_a_question_stands(block: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It was drawn over the questions ten times a second."""
+    bars: list[bool] = []
+
+    class Terminal(io.StringIO):
+        def isatty(self) -> bool:
+            return True
+
+    with Progress(Terminal()) as progress:
+        live = progress._bar.live
+        monkeypatch.setattr("typer.prompt", lambda question, default: bars.append(live.is_started) or "answer")
+        monkeypatch.setattr("sys.stdin", Terminal())
+        ask = _asks(progress)
+        assert ask is not None and live.is_started
+        assert ask("What?", None) == "answer"
+        assert live.is_started and bars == [False]
 
 
 @pytest.mark.parametrize("text", ["ball:0.01", "cylinder:0.01,0.03", "box:0.02,0.015,0.04"])

@@ -19,7 +19,7 @@ from livedeform.new.markers import fit_note, read_places
 from livedeform.new.picture import draw
 from livedeform.new.questions import Answers, Ask, answered, questions
 from livedeform.new.writing import experiment_text
-from livedeform.outputs import prepared, write_json, write_text
+from livedeform.outputs import checked, prepared, write_json, write_text
 
 MARKERS, SCHEMA, PICTURE = "markers.csv", "experiment.schema.json", "experiment.png"
 
@@ -54,6 +54,8 @@ def make_experiment(
     ``given`` are the answers that are known already, by question; ``ask`` asks for the others (None: what has a safe
     default is assumed). ``InputError`` for what cannot be meant; then nothing is written.
     """
+    written = [FILE_NAME, MARKERS, SCHEMA, PICTURE]
+    checked(out, [*written, sources.surface.name], [sources.surface, sources.markers], force=force)  # before it asks
     tell("reading the surface and the markers")
     body = read_new_body(sources.surface, sources.surface_unit)
     markers, note = read_places(
@@ -62,7 +64,7 @@ def make_experiment(
     answers = answered(questions(body, out), given, ask)
     cameras = answers["cameras"]
     copies = _copies(sources.surface, answers)
-    names = [FILE_NAME, MARKERS, SCHEMA, PICTURE, *copies.values()]
+    names = [*written, *copies.values()]
     text = experiment_text(
         answers, sources.surface.name, body.unit, None if cameras is None else [copies[Path(file)] for file in cameras]
     )
