@@ -10,10 +10,14 @@ import pytest
 import trimesh
 import yaml
 
+from livedeform.common.checks.declared import check_declared
 from livedeform.common.effect import EffectInfo, Parameter
 from livedeform.common.errors import InputError
+from livedeform.common.experiment.plausibility import read_body
+from livedeform.common.experiment.schema import USED_SIGMAS
 from livedeform.common.experiment.yaml_file import json_schema, load_experiment, save_experiment
 from livedeform.common.types import EffectValues
+from livedeform.fem_node.effects import EFFECTS
 
 
 def complaint(folder, **options) -> str:
@@ -150,6 +154,40 @@ def test_sigma_companions(change):
     assert experiment.sigma("loads.0.force") == 0.01
     assert experiment.sigma("phantom.material.poisson_ratio") is None
     assert experiment.sigma("timeline.release") is None
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("version_sigma", 1), ("name_sigma", 1.0), ("loads_sigma", 1.0), ("effects_sigma", 1.0), ("probe_sigma", 1.0),
+        ("phantom.support_sigma", 1.0), ("phantom.element_size_sigma", 0.001), ("phantom.surface_sigma", 1.0),
+        ("phantom.support.0.region_sigma", 1.0), ("timeline.clock_start_ns_sigma", 1.0),
+        ("thresholds.error_sigma", 1.0),
+    ],
+)  # fmt: skip
+def test_what_is_no_quantity_has_no_standard_deviation(change, key, value):
+    change("timeline", {"release": 0.0, "clock_start_ns": 5})
+    change("effects", [{"name": "stiffness", "ratio": 1.2}])
+    change("thresholds", {"error": 0.005})
+    line = complaint(change(key, value))
+    assert f"'{key.removesuffix('_sigma').rpartition('.')[2]}' is no physical quantity" in line
+    assert "phantom.material.youngs_modulus, phantom.material.poisson_ratio, timeline.release" in line
+
+
+def test_standard_deviations_that_nothing_uses_are_told(change):
+    for key in ("phantom.density_sigma", "phantom.gravity_sigma", "loads.0.force_sigma", "probe.edge_radius_sigma"):
+        change(key, 0.01)
+    folder = change("recordings", {"a*": {"release": 0.2, "release_sigma": 0.02}})
+    experiment = load_experiment(folder)
+    assert experiment.sigmas["phantom.density"] == 0.01 and experiment.sigmas["recordings.a*.release"] == 0.02
+    (finding,) = [f for f in check_declared(experiment, read_body(experiment)) if "standard deviations" in f.text]
+    unused = "phantom.gravity, probe.edge_radius, loads.0.force, recordings.a*.release; a diagnosis"
+    assert finding.level == "NOTE" and unused in finding.text
+
+
+def test_those_that_are_said_to_be_used_are(change):
+    stated = {p.stated_by for effect in EFFECTS.values() for p in effect.INFO.parameters if p.stated_by}
+    assert {*stated, "timeline.release"} == set(USED_SIGMAS)
 
 
 def test_a_number_in_scientific_notation_without_a_point_is_a_number(change):

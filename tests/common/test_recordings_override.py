@@ -32,6 +32,14 @@ def test_the_recordings_that_a_line_fits_have_what_it_says(change):
     assert "weight 0 0 -0.9 N" in heavy.acting.text and "release 0.2 s" in heavy.acting.text
 
 
+def test_a_standard_deviation_goes_with_what_is_said(change):
+    change("timeline", {"release": 0.1, "release_sigma": 0.005})
+    said = {"a": {"release": 0.2, "release_sigma": 0.02}, "b": {"release": 0.3}, "c": {"loads": []}}
+    experiment = load_experiment(change("recordings", said))
+    sigmas = [experiment.of_recording(name).sigma("timeline.release") for name in "abcd"]
+    assert sigmas == [0.02, 0.005, 0.005, 0.005] and experiment.sigma("timeline.release") == 0.005
+
+
 def test_no_loads_are_none_and_not_those_of_the_experiment(change):
     experiment = load_experiment(change("recordings", {"bare": {"loads": []}}))
     assert experiment.loads and not experiment.of_recording("bare").loads

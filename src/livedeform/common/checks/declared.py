@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from livedeform.common.checks.finding import Finding
-from livedeform.common.experiment.schema import Experiment
+from livedeform.common.experiment.schema import USED_SIGMAS, Experiment
 from livedeform.common.experiment.surface import Surface
 
 COLLAPSE = 5.0  # weight of a column as high as the body over its modulus: all but flat layers are crushed by it
@@ -13,8 +13,9 @@ STEEP = 1.0  # rad, of a tilt
 
 
 def check_declared(experiment: Experiment, body: Surface) -> list[Finding]:
-    """Doubt a body that its own weight crushes, and a tilt of gravity that is in degrees by all likelihood."""
-    return [*_weight(experiment, body), *_tilt(experiment)]
+    """Doubt a body that its own weight crushes, and a tilt of gravity that is in degrees by all likelihood; name the
+    standard deviations that nothing uses."""
+    return [*_weight(experiment, body), *_tilt(experiment), *_unused(experiment)]
 
 
 def _weight(experiment: Experiment, body: Surface) -> list[Finding]:
@@ -39,3 +40,11 @@ def _tilt(experiment: Experiment) -> list[Finding]:
                 text = f"the effect 'gravity_tilt' turns gravity by {angle:.3g} rad, {np.degrees(angle):.0f} degrees"
                 found.append(Finding("WARN", text, "give its angles in radians: 2 degrees are 0.035"))
     return found
+
+
+def _unused(experiment: Experiment) -> list[Finding]:
+    unused = [key for key in experiment.sigmas if key not in USED_SIGMAS]
+    if not unused:
+        return []
+    text = f"standard deviations that nothing uses: {', '.join(unused)}; a diagnosis uses those of "
+    return [Finding("NOTE", text + f"{', '.join(USED_SIGMAS)}, of effects and of markers")]

@@ -8,12 +8,12 @@ from __future__ import annotations
 
 import difflib
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,6 +40,10 @@ from livedeform.common.published_effects import EFFECT_PARAMETERS, KEEP_ONE, OPT
 from livedeform.common.types import Array, EffectValues, Ids
 
 SIGMA = "_sigma"
+USED_SIGMAS = (  # what a diagnosis takes as priors, and for how well a release is known
+    "phantom.density", "phantom.material.youngs_modulus", "phantom.material.poisson_ratio", "timeline.release",
+)  # fmt: skip
+SETTINGS = ("version", "clock_start_ns", "element_size", "error")  # numbers that nobody measures
 FLOAT_MAX = float(np.finfo(float).max)
 ABSOLUTE_ZERO, MOST_APART = -273.15, 200.0  # degrees; Celsius and kelvin beside each other are 273 apart
 LONGEST_STAMP = 30  # digits; no float holds those of a stamp in nanoseconds
@@ -144,8 +148,12 @@ class Section(BaseModel):
         values = {key: as_number(value) if cls._is_of_numbers(key) else value for key, value in data.items()}
         sigmas = {}
         for key in [k for k in values if isinstance(k, str) and k.endswith(SIGMA)]:
-            if key.removesuffix(SIGMA) in cls._quantities(values):
-                sigmas[key.removesuffix(SIGMA)] = _read_sigma(key, values.pop(key))
+            quantity = key.removesuffix(SIGMA)
+            if quantity in cls._quantities(values):
+                sigmas[quantity] = _read_sigma(key, values.pop(key))
+            elif quantity in values and quantity in cls.model_fields:
+                remedy = f"leave it out; a diagnosis uses those of {', '.join(USED_SIGMAS)}"
+                raise problem(f"'{quantity}' is no physical quantity, and has no standard deviation", remedy)
         known = cls._known(values)
         for key in values:
             if known is not None and key not in known:
@@ -176,7 +184,7 @@ class Section(BaseModel):
     @classmethod
     def _quantities(cls, values: Mapping[str, Any]) -> list[str]:
         """The keys that may have a ``_sigma`` companion."""
-        return [k for k, v in values.items() if not isinstance(v, str | bool | Mapping)]
+        return [k for k, v in values.items() if k not in SETTINGS and _is_quantity(v)]
 
     @model_serializer(mode="wrap")
     def _write(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
@@ -193,13 +201,23 @@ class Section(BaseModel):
     def __get_pydantic_json_schema__(cls, core_schema: Any, handler: GetJsonSchemaHandler) -> dict[str, Any]:
         schema = handler.resolve_ref_schema(handler(core_schema))
         for key, entry in list(schema.get("properties", {}).items()):
-            if "number" in str(entry) and key != "version":
+            if "number" in str(entry) and key not in SETTINGS:
                 schema["properties"][key + SIGMA] = {
                     "type": "number",
                     "exclusiveMinimum": 0,
                     "description": f"one standard deviation of {key}",
                 }
         return schema
+
+
+AnySection = TypeVar("AnySection", bound=Section)
+
+
+def _is_quantity(value: Any) -> bool:
+    """A number or numbers in lists, which may be wrong; what has keys of its own, a name or nothing is none."""
+    if isinstance(value, list | tuple):
+        return bool(value) and all(_is_quantity(item) for item in value)
+    return not isinstance(value, str | bool | Mapping | BaseModel)
 
 
 def _read_sigma(key: str, value: Any) -> float:
@@ -840,6 +858,11 @@ class Experiment(Section):
             out = out.under(override)
         return out
 
+    @property
+    def sigmas(self) -> dict[str, float]:
+        """Every standard deviation that the file gives, by the quantity's key with dots."""
+        return dict(_sigmas_in(self, ""))
+
     def overrides(self, name: str) -> list[Override]:
         """What is said of the recording of that name, the last to decide last; empty where no line fits it."""
         return [said for key, said in self.recordings.items() if fnmatchcase(name, key.removesuffix(".mcap"))]
@@ -855,11 +878,32 @@ class Experiment(Section):
         if acting.loads is not None:
             update["loads"] = acting.loads
         if acting.gravity is not None:
-            update["phantom"] = self.phantom.model_copy(update={"gravity": acting.gravity})
+            update["phantom"] = _with(self.phantom, "gravity", acting)
         if acting.release is not None:
-            update["timeline"] = self.timeline.model_copy(update={"release": acting.release})
+            update["timeline"] = _with(self.timeline, "release", acting)
         return self.model_copy(update=update) if update else self
 
     def with_effects(self, effects: Sequence[EffectValues]) -> Experiment:
         """The same experiment with another list of effects."""
         return self.model_copy(update={"effects": tuple(effects)})
+
+
+def _with(section: AnySection, key: str, said: Section) -> AnySection:
+    """Return a section with what another says of a key, and with its standard deviation where one is given."""
+    out = section.model_copy(update={key: getattr(said, key)})
+    out._sigmas = section._sigmas | {k: sigma for k, sigma in said._sigmas.items() if k == key}
+    return out
+
+
+def _sigmas_in(value: Any, place: str) -> Iterator[tuple[str, float]]:
+    """Give the standard deviations of a section and of all in it."""
+    parts: Iterable[tuple[Any, Any]] = ()
+    if isinstance(value, Section):
+        yield from ((f"{place}{key}", sigma) for key, sigma in value._sigmas.items())
+        parts = value
+    elif isinstance(value, Mapping):
+        parts = value.items()
+    elif isinstance(value, tuple):
+        parts = enumerate(value)
+    for key, part in parts:
+        yield from _sigmas_in(part, f"{place}{key}.")
