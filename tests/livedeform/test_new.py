@@ -272,7 +272,8 @@ def test_the_progress_bar_is_away_while_a_question_stands(block: Path, monkeypat
         live = progress._bar.live
         monkeypatch.setattr("typer.prompt", lambda question, default: bars.append(live.is_started) or "answer")
         monkeypatch.setattr("sys.stdin", Terminal())
-        ask = _asks(progress)
+        assert _asks(progress, True) is None
+        ask = _asks(progress, False)
         assert ask is not None and live.is_started
         assert ask("What?", None) == "answer"
         assert live.is_started and bars == [False]

@@ -107,9 +107,7 @@ def new(
     given = {name: context.params[name] for name in ANSWERED}
     sources = Sources(surface, markers, unit, markers_unit, parse_span(rest), read_places_of(place or []))
     with Progress() as progress:
-        lines = make_experiment(
-            folder, sources, given, ask=None if yes else _asks(progress), force=force, tell=progress
-        )
+        lines = make_experiment(folder, sources, given, ask=_asks(progress, yes), force=force, tell=progress)
     typer.echo("\n".join([*lines, _next(folder)]))
 
 
@@ -118,11 +116,12 @@ def _next(folder: Path) -> str:
     return f"look at it: livedeform view {folder}; then record, and: livedeform info BAG --experiment {folder}"
 
 
-def _asks(progress: Progress) -> Callable[[str, str | None], str] | None:
-    """Return what asks a question on the terminal, without the progress; None where there is none."""
+def _asks(progress: Progress, yes: bool) -> Callable[[str, str | None], str] | None:
+    """Return what asks a question on the terminal, without the progress; None where there is none, or nothing is to be
+    asked (``yes``)."""
 
     def ask(question: str, default: str | None) -> str:
         with progress.paused():
             return str(typer.prompt(question, default=default))
 
-    return ask if sys.stdin.isatty() else None
+    return ask if sys.stdin.isatty() and not yes else None

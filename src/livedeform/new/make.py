@@ -13,7 +13,7 @@ from livedeform.common.errors import InputError
 from livedeform.common.experiment.markers_file import write_markers
 from livedeform.common.experiment.yaml_file import FILE_NAME, json_schema, load_experiment
 from livedeform.common.types import Array
-from livedeform.new.body import read_new_body
+from livedeform.new.body import NewBody, read_new_body
 from livedeform.new.inspected import inspected
 from livedeform.new.markers import fit_note, read_places
 from livedeform.new.picture import draw
@@ -77,15 +77,21 @@ def make_experiment(
         findings = inspected(draft, {**{name: file for file, name in copies.items()}, MARKERS: sources.markers})
         tell("drawing the body")
         draw(load_experiment(draft), draft / PICTURE)
-    size = " x ".join(f"{1e3 * s:.1f}" for s in body.size)
+    assumed = [f"assumed: {'; '.join(answers.assumed)}"] if answers.assumed else []
+    sound = f"{out / FILE_NAME}: sound; {out / PICTURE} shows it"
     return [
-        f"body: {size} mm, the surface file is in {body.unit}",
+        _said_of_body(body),
         f"read: {note}",
         f"markers: {fit_note(markers, body.surface)}",
-        *([f"assumed: {'; '.join(answers.assumed)}"] if answers.assumed else []),
+        *assumed,
         *findings,
-        f"{out / FILE_NAME}: sound; {out / PICTURE} shows it",
+        sound,
     ]
+
+
+def _said_of_body(body: NewBody) -> str:
+    size = " x ".join(f"{1e3 * s:.1f}" for s in body.size)
+    return f"body: {size} mm, the surface file is in {body.unit}"
 
 
 def _copies(surface: Path, answers: Answers) -> dict[Path, str]:

@@ -104,7 +104,7 @@ def _quoted(text: str) -> str:
 
 
 def _size(value: Any) -> str:
-    """What follows a probe's shape: a number, several, or a file's name."""
+    """Write what follows a probe's shape: a number, several, or a file's name."""
     return _quoted(value) if isinstance(value, str) else json.dumps(value)
 
 

@@ -199,7 +199,7 @@ def _across(surface: Surface) -> float:
 
 
 def _far(surface: Surface) -> float:
-    """From which length (m) on something beside the body is in millimetres by all likelihood."""
+    """Return the length (m) from which on something beside the body is in millimetres by all likelihood."""
     return max(TIMES_THE_BODY * _across(surface), LARGEST_BESIDE)
 
 

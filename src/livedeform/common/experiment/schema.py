@@ -864,7 +864,7 @@ class Experiment(Section):
         return dict(_sigmas_in(self, ""))
 
     def overrides(self, name: str) -> list[Override]:
-        """What is said of the recording of that name, the last to decide last; empty where no line fits it."""
+        """Return what is said of the recording of that name, the last to decide last; empty where no line fits it."""
         return [said for key, said in self.recordings.items() if fnmatchcase(name, key.removesuffix(".mcap"))]
 
     @property
