@@ -11,6 +11,7 @@ import numpy as np
 
 from livedeform.common.errors import InputError
 from livedeform.common.experiment.markers_file import write_markers
+from livedeform.common.experiment.schema import Markers
 from livedeform.common.experiment.yaml_file import FILE_NAME, json_schema, load_experiment
 from livedeform.common.types import Array
 from livedeform.new.body import NewBody, read_new_body
@@ -69,24 +70,23 @@ def make_experiment(
         answers, sources.surface.name, body.unit, None if cameras is None else [copies[Path(file)] for file in cameras]
     )
     with prepared(out, names, force=force, inputs=[*copies, sources.markers], alone=False) as draft:
-        for file, name in copies.items():
-            shutil.copyfile(file, draft / name)
-        write_markers(draft / MARKERS, markers)
-        write_text(draft / FILE_NAME, text)
-        write_json(draft / SCHEMA, json_schema())
+        _write(draft, copies, markers, text)
         findings = inspected(draft, {**{name: file for file, name in copies.items()}, MARKERS: sources.markers})
         tell("drawing the body")
         draw(load_experiment(draft), draft / PICTURE)
     assumed = [f"assumed: {'; '.join(answers.assumed)}"] if answers.assumed else []
     sound = f"{out / FILE_NAME}: sound; {out / PICTURE} shows it"
-    return [
-        _said_of_body(body),
-        f"read: {note}",
-        f"markers: {fit_note(markers, body.surface)}",
-        *assumed,
-        *findings,
-        sound,
-    ]
+    of_markers = [f"read: {note}", f"markers: {fit_note(markers, body.surface)}"]
+    return [_said_of_body(body), *of_markers, *assumed, *findings, sound]
+
+
+def _write(draft: Path, copies: Mapping[Path, str], markers: Markers, text: str) -> None:
+    """Write all but the picture into a folder."""
+    for file, name in copies.items():
+        shutil.copyfile(file, draft / name)
+    write_markers(draft / MARKERS, markers)
+    write_text(draft / FILE_NAME, text)
+    write_json(draft / SCHEMA, json_schema())
 
 
 def _said_of_body(body: NewBody) -> str:
