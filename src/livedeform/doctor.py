@@ -166,16 +166,26 @@ def _opencv() -> tuple[bool, str]:
 
 
 def _writing() -> tuple[bool, str]:
-    """A bag can be written and read back."""
-    from livedeform.common.bags.read import read_bag
-    from livedeform.common.bags.write import BagWriter
+    """A message that is written to a bag is read back as it was."""
+    import numpy as np
 
+    from livedeform.common.bags.read import read_bag
+    from livedeform.common.bags.recording import load_recording
+    from livedeform.common.bags.recording_writer import RecordingWriter
+    from livedeform.common.bags.write import BagWriter
+    from livedeform.common.types import Pose
+
+    written = Pose(1_000_000_001, np.array([0.25, -0.5, 1e-9]), np.array([0.0, 0.6, 0.0, 0.8]))
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "check.mcap"
-        with BagWriter(path, {"made_by": "livedeform doctor"}):
-            pass
-        with read_bag(path):
-            pass
+        with BagWriter(path, {"made_by": "livedeform doctor"}) as bag:
+            RecordingWriter(bag).pose(written)
+        with read_bag(path) as read:
+            n = read.n_messages
+        poses = load_recording(path).poses
+    whole = [(p.stamp_ns, *p.position, *p.orientation_xyzw) for p in poses]
+    if n != 1 or whole != [(written.stamp_ns, *written.position, *written.orientation_xyzw)]:
+        raise RuntimeError(f"of one message that was written, {n} came back, as {whole}")
     return True, "a recording was written and read back"
 
 

@@ -15,9 +15,10 @@ from livedeform.common.bags.pictures import read_camera_info
 from livedeform.common.bags.read import BagReader, read_bag
 from livedeform.common.bags.recording import Recording, header_stamp_ns, load_recording, to_image
 from livedeform.common.bags.types import RawMessage, decode
+from livedeform.common.checks.declared import check_declared
 from livedeform.common.checks.finding import Finding, Severity
 from livedeform.common.checks.protocol import ProtocolStep, protocol
-from livedeform.common.checks.recorded import check_recording
+from livedeform.common.checks.recorded import check_named, check_recording
 from livedeform.common.errors import CalibrationError, InputError, MeshError, RecordingError
 from livedeform.common.experiment.plausibility import TETRAHEDRON_VOLUME, read_body
 from livedeform.common.experiment.schema import Markers
@@ -31,6 +32,10 @@ LARGE_OFFSET = 1.0  # s between stamp and receive time
 OFFSET_DRIFT = 0.1  # s by which that offset may change within a recording
 DECODED = (t.STEREO_MARKERS, t.PROBE_POSE, t.PROBE_WRENCH)  # message by message; pictures would take too long
 STREAMS = (t.STEREO_MARKERS, t.STEREO_SURFACE, t.PROBE_POSE, *t.IMAGES, *t.COMPRESSED_IMAGES)
+# what every diagnosis.json has (interfaces, section 5), and what its verdict can be
+OF_A_DIAGNOSIS = ("version", "verdict", "effects", "candidates", "error_before", "error_after", "noise_floor",
+                  "improvement_interval", "unexplained")  # fmt: skip
+VERDICTS = ("none", "effect", "unexplained", "undecided")
 
 
 @dataclass(frozen=True)
@@ -131,7 +136,7 @@ def fit_findings(bag: BagReader, experiment: Experiment, recording: Recording) -
     if wrong:  # nothing more can be read
         return wrong
     acting = experiment.of_recording(recording.own_name)
-    return [*_Fit(bag, acting).findings(), *check_recording(recording, acting)]
+    return [*_Fit(bag, acting).findings(), *check_named(recording, acting), *check_recording(recording, acting)]
 
 
 class _Tracks:
@@ -341,7 +346,7 @@ def inspect_experiment(path: Path) -> Report:
         "effects": ", ".join(effect.name for effect in experiment.effects) or "none",
         "verdict at": f"{1e3 * experiment.thresholds.error:g} mm",
     }
-    findings = _body_findings(experiment) + _calibration_findings(experiment)
+    findings = _body_findings(experiment) + check_declared(experiment, body) + _calibration_findings(experiment)
     if experiment.stereo is not None:
         findings += _detector_findings(experiment)
     if 0 < len(markers.ids) < 3:
@@ -401,8 +406,11 @@ def _detector_findings(experiment: Experiment) -> list[Finding]:
 
 def _inspect_run(path: Path, experiment: Experiment | None) -> Report:
     bag = inspect_bag(path / "run.mcap", experiment)
-    facts = {**_numbers(path / "metrics.json"), **bag.facts}
+    metrics = _document(path / "metrics.json")
+    facts = {**_numbers(metrics), **bag.facts}
     findings = list(bag.findings)
+    if (path / "metrics.json").is_file() and "verdict" not in metrics:
+        findings.append(Finding("WARN", "metrics.json has no verdict: it was changed, or another program wrote it"))
     for name in ("metrics.json", "markers.csv", "report.html"):
         if not (path / name).is_file():
             findings.append(Finding("WARN", f"{name} is missing: the run did not end in order"))
@@ -410,17 +418,30 @@ def _inspect_run(path: Path, experiment: Experiment | None) -> Report:
 
 
 def _inspect_diagnosis(path: Path) -> Report:
-    return Report("diagnosis", str(path), _numbers(path / "diagnosis.json"))
+    document = _document(path / "diagnosis.json")
+    findings = []
+    if missing := [key for key in OF_A_DIAGNOSIS if key not in document]:
+        text = f"diagnosis.json has no {', '.join(missing)}: it was changed, or another program wrote it"
+        findings.append(Finding("ERROR", text, "run livedeform diagnose again"))
+    elif document["verdict"] not in VERDICTS:
+        text = f"the verdict of diagnosis.json is {document['verdict']!r}; known are {', '.join(VERDICTS)}"
+        findings.append(Finding("ERROR", text, "run livedeform diagnose again"))
+    return Report("diagnosis", str(path), _numbers(document), (), tuple(findings))
 
 
-def _numbers(path: Path) -> dict[str, str]:
-    """The plain values of a JSON file, with dotted names."""
+def _document(path: Path) -> dict[str, Any]:
+    """The content of a JSON file; empty where there is none, and where it holds no names with values."""
     if not path.is_file():
         return {}
     try:
         document = json.loads(path.read_text())
     except ValueError as error:
         raise InputError(f"is not valid JSON ({error})", where=str(path), remedy="run the command again") from error
+    return document if isinstance(document, dict) else {}
+
+
+def _numbers(document: dict[str, Any]) -> dict[str, str]:
+    """The plain values of a document, with dotted names."""
     out: dict[str, str] = {}
 
     def walk(prefix: str, value: Any) -> None:

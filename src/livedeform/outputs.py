@@ -75,7 +75,7 @@ def has_results(out: Path, names: Iterable[str]) -> bool:
     return any((out / name).exists() for name in names)
 
 
-def _checked(out: Path, names: Sequence[str], inputs: Sequence[Path | None], *, force: bool) -> bool:
+def checked(out: Path, names: Sequence[str], inputs: Sequence[Path | None], *, force: bool) -> bool:
     """Return whether there are earlier results; raises InputError where nothing may be written."""
     if out.exists() and not out.is_dir():
         raise InputError("is a file", where=str(out), remedy="name a folder with --out")
@@ -108,7 +108,7 @@ def prepared(
     that was killed left behind is removed first, or named.
     """
     names = (*names, CONFIGURATION) if alone else tuple(names)
-    present = _checked(out, names, inputs, force=force)
+    present = checked(out, names, inputs, force=force)
     drafts.tidy(out)
     made = [folder for folder in (out, *out.parents) if not folder.exists()]
     draft = _made(out, drafts.RECORDED if in_place else drafts.DRAFT, in_place=in_place and not present)

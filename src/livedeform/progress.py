@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from types import TracebackType
 from typing import Any, Self, TextIO
 
@@ -50,6 +51,17 @@ class Progress:
             percent = f" ({100 * fraction:.0f} %)" if fraction is not None else ""
             print(f"{text}{percent}", file=self._stream, flush=True)
             self._last, self._last_text = now, text
+
+    @contextmanager
+    def paused(self) -> Iterator[None]:
+        """Take the bar away while something is asked: it is drawn over what others write."""
+        if self._bar is not None:
+            self._bar.stop()
+        try:
+            yield
+        finally:
+            if self._bar is not None:
+                self._bar.start()
 
     def line(self, text: str) -> None:
         """A line that stays."""

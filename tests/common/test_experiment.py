@@ -10,10 +10,14 @@ import pytest
 import trimesh
 import yaml
 
+from livedeform.common.checks.declared import check_declared
 from livedeform.common.effect import EffectInfo, Parameter
 from livedeform.common.errors import InputError
+from livedeform.common.experiment.plausibility import read_body
+from livedeform.common.experiment.schema import USED_SIGMAS
 from livedeform.common.experiment.yaml_file import json_schema, load_experiment, save_experiment
 from livedeform.common.types import EffectValues
+from livedeform.fem_node.effects import EFFECTS
 
 
 def complaint(folder, **options) -> str:
@@ -103,6 +107,43 @@ thresholds: {error: 0.005}
     assert text != published
 
 
+@pytest.mark.parametrize(
+    ("text", "value"), [("4e3", 4000.0), ("4E3", 4000.0), ("+4.e3", 4000.0), ("'4000'", 4000.0), ("4_000", 4000.0)]
+)
+def test_a_number_may_be_written_in_any_way_with_its_companion_beside_it(folder, text, value):
+    """YAML 1.1 reads 4e3 as a text."""
+    written = (folder / "experiment.yaml").read_text()
+    new = written.replace("youngs_modulus: 4000.0,", f"youngs_modulus: {text}, youngs_modulus_sigma: 2e2,")
+    new = new.replace("effects: []", "effects: [{name: viscoelasticity, g: [3e-1], tau: [2e0], tau_sigma: [1e-1]}]")
+    new = new.replace("model: neo_hookean,", "model: yeoh, c2_ratio: 1e-1,")
+    new += "temperature: {time: [0, 1e2], value: [2e1, 21], reference: 2e1}\n"
+    (folder / "experiment.yaml").write_text(new)
+    experiment = load_experiment(folder)
+    material = experiment.phantom.material
+    assert material.youngs_modulus == value and experiment.sigma("phantom.material.youngs_modulus") == 200.0
+    assert material.parameters == {"c2_ratio": 0.1} and experiment.temperatures == ((0.0, 100.0), (20.0, 21.0))
+    assert experiment.effects[0].values["g"].tolist() == [0.3] and experiment.effects[0].sigmas["tau"].tolist() == [0.1]
+
+
+def test_a_name_may_look_like_a_number(change):
+    change("name", "4e3")
+    change("loads.0.name", "2e1")
+    experiment = load_experiment(change("timeline", {"clock_start_ns": "1700000000000000001"}))
+    assert (experiment.name, experiment.loads[0].name) == ("4e3", "2e1")
+    assert experiment.timeline.clock_start_ns == 1_700_000_000_000_000_001
+
+
+@pytest.mark.parametrize("text", ["04000", "-04000", "0_4000"])
+def test_a_number_with_a_leading_zero_is_not_read_to_the_base_8(folder, text):
+    document = (folder / "experiment.yaml").read_text()
+    (folder / "experiment.yaml").write_text(document.replace("youngs_modulus: 4000.0", f"youngs_modulus: {text}"))
+    line = complaint(folder)
+    assert f"experiment.yaml:10: {text} begins with a zero, and is read as 2048" in line
+    for same in ("0900.0", "'04000'", "4000"):  # no octal numbers
+        (folder / "experiment.yaml").write_text(document.replace("youngs_modulus: 4000.0", f"youngs_modulus: {same}"))
+        load_experiment(folder)
+
+
 def test_sigma_companions(change):
     change("phantom.material.youngs_modulus_sigma", 200.0)
     change("phantom.density_sigma", 5)
@@ -113,6 +154,40 @@ def test_sigma_companions(change):
     assert experiment.sigma("loads.0.force") == 0.01
     assert experiment.sigma("phantom.material.poisson_ratio") is None
     assert experiment.sigma("timeline.release") is None
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("version_sigma", 1), ("name_sigma", 1.0), ("loads_sigma", 1.0), ("effects_sigma", 1.0), ("probe_sigma", 1.0),
+        ("phantom.support_sigma", 1.0), ("phantom.element_size_sigma", 0.001), ("phantom.surface_sigma", 1.0),
+        ("phantom.support.0.region_sigma", 1.0), ("timeline.clock_start_ns_sigma", 1.0),
+        ("thresholds.error_sigma", 1.0),
+    ],
+)  # fmt: skip
+def test_what_is_no_quantity_has_no_standard_deviation(change, key, value):
+    change("timeline", {"release": 0.0, "clock_start_ns": 5})
+    change("effects", [{"name": "stiffness", "ratio": 1.2}])
+    change("thresholds", {"error": 0.005})
+    line = complaint(change(key, value))
+    assert f"'{key.removesuffix('_sigma').rpartition('.')[2]}' is no physical quantity" in line
+    assert "phantom.material.youngs_modulus, phantom.material.poisson_ratio, timeline.release" in line
+
+
+def test_standard_deviations_that_nothing_uses_are_told(change):
+    for key in ("phantom.density_sigma", "phantom.gravity_sigma", "loads.0.force_sigma", "probe.edge_radius_sigma"):
+        change(key, 0.01)
+    folder = change("recordings", {"a*": {"release": 0.2, "release_sigma": 0.02}})
+    experiment = load_experiment(folder)
+    assert experiment.sigmas["phantom.density"] == 0.01 and experiment.sigmas["recordings.a*.release"] == 0.02
+    (finding,) = [f for f in check_declared(experiment, read_body(experiment)) if "standard deviations" in f.text]
+    unused = "phantom.gravity, probe.edge_radius, loads.0.force, recordings.a*.release; a diagnosis"
+    assert finding.level == "NOTE" and unused in finding.text
+
+
+def test_those_that_are_said_to_be_used_are(change):
+    stated = {p.stated_by for effect in EFFECTS.values() for p in effect.INFO.parameters if p.stated_by}
+    assert {*stated, "timeline.release"} == set(USED_SIGMAS)
 
 
 def test_a_number_in_scientific_notation_without_a_point_is_a_number(change):
@@ -177,6 +252,12 @@ MISTAKES = [
     ("phantom.support.0.region", {"below_z": -0.01}, "touches no part of the body", "correct"),
     ("phantom.support.0.region", {"below_z": 0.01, "above_z": 0.02}, "below_z and above_z", "one of"),
     ("phantom.support.0.region", {}, "here is nothing", "one of"),
+    (
+        "phantom.support.0.region",
+        {"box": [[-0.01, -0.01, 0.02], [0.01, 0.01, 0.03]]},
+        "lies inside its surface",
+        "correct",
+    ),
     ("phantom.support.0.region", {"sphere": {"centre": [0.2, 0, 0], "radius": 0.01}}, "touches no part", ""),
     ("phantom.support.0.region", {"box": [[0, 0, 0], [0, 1, 1]]}, "first corner", ""),
     ("phantom.support.0.type", "glued", "phantom.support.0.type", ""),
@@ -308,6 +389,38 @@ def test_markers_on_the_table_may_be_farther_off(folder):
     assert "marker 2 is 0.12 m from the body" in complaint(folder)
     (folder / "markers.csv").write_text("id,x,y,z,kind\n1,0,0,0.05,surface\n2,0.15,0,0,support\n")
     load_experiment(folder)
+
+
+@pytest.mark.parametrize("header", ["id,x,y,z,kind", "ID, X, Y, Z, Kind", "# one kind\n\nkind,id,x,y,z", "id,x,y,z"])
+def test_whether_kinds_are_stated_is_told_by_the_columns(folder, header):
+    row = "internal,1,0,0,0.02" if "kind,id" in header else "1,0,0,0.02,internal"
+    row = row.removesuffix(",internal") if header == "id,x,y,z" else row
+    (folder / "markers.csv").write_text(f"# measured by hand, no kind\n{header}\n{row}\n")
+    markers = load_experiment(folder).markers
+    assert markers.kinds_stated == ("kind" in header.lower().splitlines()[-1])
+    assert markers.kinds.tolist() == ["internal" if markers.kinds_stated else "surface"]
+
+
+@pytest.mark.parametrize(
+    ("name", "wanted"), [("kinds", "kind"), ("Knid", "kind"), ("sigmas", "sigma"), ("sgima", "sigma")]
+)
+def test_a_mistyped_column_is_not_left_out_in_silence(folder, name, wanted):
+    (folder / "markers.csv").write_text(f"id,x,y,z,{name}\n1,0,0,0.02,\n")
+    assert f"a column '{name.strip()}' is not read; call it {wanted}" in complaint(folder)
+
+
+@pytest.mark.parametrize("name", ["sigma_x", "note", "X", "find", "type"])
+def test_other_columns_are_left_out(folder, name):
+    (folder / "markers.csv").write_text(f"id,x,y,z,{name}\n1,0,0,0.05,what\n")
+    assert load_experiment(folder).markers.ids.tolist() == [1]
+
+
+def test_a_mistake_in_the_markers_has_its_own_line(folder):
+    """Comments and empty lines count, too."""
+    for row, says in (("2,0,up,0.02", "y is 'up'"), ("1,0,0,0.05", "marker id 1 is there twice"), ("2,1", "y is ''")):
+        (folder / "markers.csv").write_text(f"# by hand\nid,x,y,z\n\n1,0,0,0.05\n# the second\n{row}\n")
+        line = complaint(folder)
+        assert "markers.csv:6: " in line and says in line
 
 
 def test_an_unknown_kind_of_marker(folder):

@@ -1,6 +1,7 @@
 """Distances from and containment in closed surfaces, against shapes whose answers are known."""
 
 import numpy as np
+import pytest
 import trimesh
 
 from livedeform.common.experiment.surface import Surface
@@ -36,3 +37,30 @@ def test_containment_and_distance_of_a_ball(rng):
 def test_volume():
     np.testing.assert_allclose(box().volume, 0.002, rtol=1e-12)
     np.testing.assert_allclose(ball().volume, 4 / 3 * np.pi * 0.05**3, rtol=5e-3)  # measured 2.2e-3
+
+
+@pytest.mark.parametrize(
+    ("lower", "upper", "meets"),
+    [
+        ([-0.1, -0.1, -0.1], [0.1, 0.1, 0.1], False),  # inside
+        ([-0.1, -0.1, 0.4], [0.1, 0.1, 0.6], True),  # through a face, no corner of it inside
+        ([-0.1, -0.1, 0.5], [0.1, 0.1, 0.6], True),  # on a face
+        ([-0.1, -0.1, 0.51], [0.1, 0.1, 0.6], False),
+        ([-2.0, -2.0, -2.0], [2.0, 2.0, 2.0], True),  # around it all
+        ([0.4, 0.4, 0.4], [0.6, 0.6, 0.6], True),  # at a corner
+        ([-2.0, -0.01, -0.01], [2.0, 0.01, 0.01], True),  # a needle through it
+    ],
+)
+def test_a_box_meets_a_surface_where_one_of_its_triangles_reaches_in(lower, upper, meets):
+    box = trimesh.creation.box((1.0, 1.0, 1.0))
+    surface = Surface(np.asarray(box.vertices), np.asarray(box.faces))
+    assert surface.meets_box(np.array(lower), np.array(upper)) == meets
+
+
+def test_a_box_beside_a_slanted_triangle_does_not_meet_it():
+    """The boxes of both overlap."""
+    ball = trimesh.creation.icosphere(subdivisions=3, radius=1.0)
+    surface = Surface(np.asarray(ball.vertices), np.asarray(ball.faces))
+    for at, meets in ((0.62, False), (0.57, True), (0.5, False)):  # of the sphere along (1, 1, 1): 0.577
+        middle = np.full(3, at)
+        assert surface.meets_box(middle - 0.01, middle + 0.01) == meets, at

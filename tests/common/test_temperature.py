@@ -41,6 +41,13 @@ def test_without_one_nothing_is_known(folder):
         ({"file": "temperature.csv", "reference": 20.0}, "time,temperature\n5,20\n0,21\n", "do not rise"),
         ({"file": "temperature.csv", "reference": 20.0}, "time,temperature\n", "0 times"),
         ({"file": "temperature.csv"}, "time,temperature\n0,20\n", "reference"),
+        ({"file": "temperature.csv", "reference": 20.0}, "time,temperature\n0,nan\n", "temperature.csv:2"),
+        ({**LISTS, "reference": 293.0}, "", "all in degrees Celsius, or all in kelvin"),
+        ({**LISTS, "value": [293.0, 297.0, 295.0]}, "", "all in degrees Celsius, or all in kelvin"),
+        ({**LISTS, "value": [20.0, 297.0, 22.0]}, "", "of 297 is 277 degrees from the reference 20"),
+        ({"file": "temperature.csv", "reference": 20.0}, "time,temperature\n0,293\n9,301\n", "or all in kelvin"),
+        ({**LISTS, "value": [20.0, -400.0, 22.0]}, "", "-400 degrees Celsius is below absolute zero"),
+        ({**LISTS, "reference": -300.0}, "", "-300 degrees Celsius is below absolute zero"),
     ],
 )
 def test_mistakes(change, folder, value, text, words):
@@ -49,3 +56,11 @@ def test_mistakes(change, folder, value, text, words):
         load_experiment(change("temperature", value))
     said = f"{caught.value} {caught.value.remedy}"
     assert words in said and "\n" not in said
+
+
+@pytest.mark.parametrize(
+    ("reference", "value"), [(20.0, [-60.0, 180.0]), (293.0, [213.0, 453.0]), (-190.0, [-190.0, 5.0])]
+)
+def test_frost_and_an_oven_are_temperatures(change, reference, value):
+    section = {"time": [0.0, 600.0], "value": value, "reference": reference}
+    assert load_experiment(change("temperature", section)).temperatures == ((0.0, 600.0), tuple(value))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -9,6 +10,7 @@ import yaml
 
 from livedeform.cli import app, repeat_lists
 from livedeform.cli import run as command_line
+from livedeform.common.bags.recording_writer import RecordingWriter
 from livedeform.doctor import CHECKS, Check, NotBetter, examine
 from livedeform.run.running import RunOptions, run
 from livedeform.studies import STUDIES
@@ -100,6 +102,18 @@ def test_the_doctor_finds_this_installation_whole():
     for name, check, _ in quick:
         if name not in ("solver", "cores", "kernels"):  # scipy's solver serves, too; a busy machine, a new one
             assert check()[0], name
+
+
+@pytest.mark.parametrize("lost", ["nothing is written", "another value is written"])
+def test_the_doctor_reads_back_what_it_wrote(monkeypatch: pytest.MonkeyPatch, lost: str):
+    real = RecordingWriter.pose
+    other = lambda writer, pose: real(writer, replace(pose, position=pose.position + 1.0))  # noqa: E731
+    bad = (lambda writer, pose: None) if lost == "nothing is written" else other
+    check = next(check for name, check, _ in CHECKS if name == "bags")
+    assert check() == (True, "a recording was written and read back")
+    monkeypatch.setattr(RecordingWriter, "pose", bad)
+    with pytest.raises(RuntimeError, match="of one message that was written"):
+        check()
 
 
 def test_the_doctor_says_what_is_missing(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):

@@ -13,7 +13,7 @@ from livedeform.common.bags.recording_writer import RecordingWriter
 from livedeform.common.bags.types import encode, message_class
 from livedeform.common.bags.write import BagWriter
 from livedeform.common.types import CameraCalibration, Image, MarkerFrame, Pose
-from livedeform.inspection import inspect
+from livedeform.inspection import OF_A_DIAGNOSIS, inspect
 
 MS = 1_000_000
 START = 1_700_000_000_000_000_000
@@ -198,6 +198,24 @@ def test_an_experiment_in_words(experiment):
 
 
 # --- the command -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("{}", "has no version, verdict, effects"),
+        ("[]", "has no version, verdict, effects"),
+        ('{"noise_floor": 0.1, "verdict": "none"}', "has no version, effects, candidates"),
+        (json.dumps(dict.fromkeys(OF_A_DIAGNOSIS, "fine")), "the verdict of diagnosis.json is 'fine'"),
+    ],
+)
+def test_a_diagnosis_that_lacks_something_is_not_sound(tmp_path, text, said):
+    (tmp_path / "diagnosis.json").write_text(text)
+    report = inspect(tmp_path)
+    assert not report.sound and said in report.findings[0].text
+    whole = dict.fromkeys(OF_A_DIAGNOSIS, 1.0) | {"verdict": "undecided"}
+    (tmp_path / "diagnosis.json").write_text(json.dumps(whole))
+    assert inspect(tmp_path).sound
 
 
 def test_the_command_prints_and_judges(bag, experiment, capsys):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ import trimesh
 from typer.testing import CliRunner
 
 from livedeform.cli import app, run
+from livedeform.commands.new import _asks
 from livedeform.common.errors import InputError
 from livedeform.common.experiment.probe_mesh import probe_mesh
 from livedeform.common.experiment.schema import Probe
@@ -19,6 +21,7 @@ from livedeform.new.body import read_new_body
 from livedeform.new.make import Sources, make_experiment, read_places_of
 from livedeform.new.markers import read_places
 from livedeform.new.questions import read_probe
+from livedeform.progress import Progress
 from livedeform.recording import Writer
 
 TABLE = "id,x,y,z\n1,0,0,50\n2,30,0,20\n5,0,30,20\n7,0,0,20\n9,40,0,0\n"  # mm; 7 inside, 9 beside the base
@@ -91,15 +94,37 @@ def test_without_a_terminal_every_missing_option_is_named_at_once(block: Path) -
         ({"modulus": "-4"}, "not positive"),
         ({"gravity": "9.81"}, "three numbers"),
         ({"cameras": "left.yaml"}, "does not exist"),
-        ({"support_below": "0.5"}, "whole body"),
-        ({"modulus": "4"}, "pascals"),
+        ({"support_below": "0.5"}, "--support-below: the region holds the whole body"),
+        ({"modulus": "4"}, "--modulus: .* pascals"),
+        ({"density": "1"}, "--density: 1 is not plausible"),
+        ({"poisson": "0.5"}, "--poisson: .* below 0.5"),
+        ({"gravity": "0,0,-981"}, "--gravity: "),
+        ({"element_size": "1e-5"}, "--element-size: .* tetrahedra"),
+        ({"friction": "20"}, "--friction: 20 is not plausible"),
+        ({"probe": "cylinder:0.01,0.1", "edge_radius": "0.2"}, "--edge-radius: "),
+        ({"probe": "ball:2"}, "--probe: sphere is 2 m"),
+        ({"threshold": "2"}, "--threshold: error is 2 m"),
     ],
 )
 def test_a_wrong_answer_is_one_line(block: Path, change: dict[str, str], said: str) -> None:
     with pytest.raises(InputError, match=said) as caught:
         make_experiment(block / "new", sources(block), KNOWN | change)
-    assert "\n" not in str(caught.value) and caught.value.remedy
+    assert "\n" not in str(caught.value) and caught.value.remedy and "draft" not in str(caught.value)
     assert not (block / "new").exists()
+
+
+def test_what_is_made_is_as_sound_as_info_says(block: Path) -> None:
+    """Calibrations that are none were copied, and the folder called sound."""
+    for side in ("l.yaml", "r.yaml"):
+        (block / side).write_text("abc")
+    cameras = {"cameras": f"{block / 'l.yaml'},{block / 'r.yaml'}"}
+    with pytest.raises(InputError, match=rf"{block / 'l.yaml'}: holds no keys"):
+        make_experiment(block / "new", sources(block), KNOWN | cameras)
+    assert not (block / "new").exists()
+    lines = make_experiment(block / "new", sources(block), KNOWN | {"modulus": "25"})
+    told = [f"warning: {f.text}" for f in inspect(block / "new").findings if f.level == "WARN"]
+    assert len(told) == 1 and "collapses" in told[0]
+    assert [line.partition(";")[0] for line in lines if line.startswith("warning: ")] == told
 
 
 def test_a_unit_that_cannot_be_told_is_asked_for(tmp_path: Path) -> None:
@@ -125,8 +150,21 @@ def test_a_table_s_unit_is_told_wherever_markers_are_on_the_body(block: Path, of
     rows = [f"{k},{','.join(f'{unit * x:.6f}' for x in place)}" for k, place in enumerate(places)]
     (block / "table.csv").write_text("\n".join(["id,x,y,z", *rows]))
     body = read_new_body(block / "block.stl", "mm")
-    found = read_places(block / "table.csv", body.surface, unit=None, rest=(0.0, 1.0), places={})
+    found, _ = read_places(block / "table.csv", body.surface, unit=None, rest=(0.0, 1.0), places={})
     np.testing.assert_allclose(found.points, 1e-3 * places, atol=1e-8)
+
+
+@pytest.mark.parametrize("comment", ["", "# measured 12 May\n", "# one kind of marker: beads\n\n"])
+@pytest.mark.parametrize("stated", [True, False])
+def test_kinds_are_those_of_the_table_whatever_comments_it_has(block: Path, comment: str, stated: bool) -> None:
+    """A comment above the header hid the column of kinds, and one about kinds was taken for it."""
+    rows = ["id,x,y,z,kind", "1,0,0,20,surface", "2,0,0,48,internal", "3,40,0,0,surface", "4,30,0,20,surface"]
+    table = rows if stated else [row.rpartition(",")[0] for row in rows]
+    (block / "table.csv").write_text(comment + "\n".join(table))
+    body = read_new_body(block / "block.stl", "mm")
+    found, _ = read_places(block / "table.csv", body.surface, unit="mm", rest=(0.0, 1.0), places={})
+    told, guessed = ["surface", "internal", "surface", "surface"], ["internal", "surface", "support", "surface"]
+    assert found.kinds.tolist() == (told if stated else guessed)
 
 
 def test_markers_of_a_recording_at_rest(block: Path) -> None:
@@ -146,6 +184,32 @@ def test_markers_of_a_recording_at_rest(block: Path) -> None:
     np.testing.assert_allclose(markers.points, table[::-1], atol=1e-7)  # float32 of the recording
 
 
+def test_how_markers_came_is_told_and_places_that_contradict_them_are_refused(block: Path) -> None:
+    table = np.array([[0.0, 0.0, 0.05], [0.03, 0.0, 0.02], [0.0, 0.03, 0.02], [-0.03, 0.0, 0.02]])
+    with Writer(block / "a.mcap", begins="2026-03-01") as recording:
+        for frame in range(10):
+            recording.points(0.1 * frame, [1, 2, 3, 4], table + 0.5)
+    stated = ["1=0,0,0.05", "2=0.03,0,0.02", "3=0,0.03,0.021"]  # one is 1 mm off
+    lines = make_experiment(block / "new", sources(block, "a.mcap", places=read_places_of(stated)), KNOWN)
+    assert "4 markers of a.mcap at rest, moved to 3 stated places (misfit 0.30 mm rms)" in "\n".join(lines)  # measured
+    assert any(
+        "5 markers of table.csv, in mm" in line for line in make_experiment(block / "other", sources(block), KNOWN)
+    )
+    stated[0] = "1=0,0.012,0.045"
+    with pytest.raises(InputError, match=r"--place: the stated places are .* mm"):
+        make_experiment(block / "third", sources(block, "a.mcap", places=read_places_of(stated)), KNOWN)
+    assert not (block / "third").exists()
+
+
+@pytest.mark.parametrize("n", [1, 3, 4])
+def test_markers_in_another_frame_are_not_taken_for_millimetres(block: Path, n: int) -> None:
+    """Metres some 0.4 m beside the body were all put at its origin, as millimetres."""
+    rows = [f"{k},{0.28 + 0.02 * k},{0.3 + 0.01 * (k % 2)},0.35" for k in range(n)]
+    (block / "table.csv").write_text("\n".join(["id,x,y,z", *rows]))
+    with pytest.raises(InputError, match="mm from the body; the frames differ"):
+        make_experiment(block / "new", sources(block), KNOWN)
+
+
 def test_nothing_is_overwritten_without_force(block: Path) -> None:
     make_experiment(block / "new", sources(block), KNOWN)
     with pytest.raises(InputError, match="--force"):
@@ -161,6 +225,58 @@ def test_the_command_and_the_view(block: Path) -> None:
     assert run(["view", str(block / "new"), "--no-open"]) == 0
     page = (block / "new" / "view.html").read_text()
     assert ("surface markers" in page and "Mesh3d" in page) or "mesh3d" in page
+
+
+@pytest.mark.parametrize("option", ["--unit", "--markers-unit"])
+def test_a_unit_that_nobody_knows_is_a_wrong_option(block: Path, option: str, capsys: pytest.CaptureFixture) -> None:
+    words = ["new", str(block / "new"), "--surface", str(block / "block.stl"), "--markers", str(block / "table.csv")]
+    assert run([*words, option, "cm"]) == 2
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1 and f"'{option}'" in said and "internal" not in said
+    known = ["--probe", "none", "--modulus", "4000", "--configuration", "loaded"]
+    assert run([*words, option, "mm", *known]) == 0
+
+
+@pytest.mark.parametrize(
+    "name", ["my # phantom", "phantom 😀", "a: b {c} 'd' \"e\"", "- \\ %", "tab\there\x7f", "007", "$\\frac$"]
+)
+def test_any_name_comes_back(block: Path, name: str) -> None:
+    (block / "table.csv").write_text(TABLE)
+    (block / "block.stl").rename(block / "my # block {1}.stl")
+    surface = Sources(block / "my # block {1}.stl", block / "table.csv")
+    trimesh.creation.box((0.02, 0.02, 0.02)).export(block / "a, # probe.stl")
+    probe = {"probe": f"mesh:{block / 'a, # probe.stl'}"}
+    make_experiment(block / "new", surface, KNOWN | probe | {"name": name})
+    experiment = load_experiment(block / "new")
+    assert experiment.name == name
+    assert experiment.phantom.surface == (block / "new" / "my # block {1}.stl").resolve()
+    assert experiment.probe is not None and experiment.probe.shape.mesh is not None
+    assert experiment.probe.shape.mesh.name == "a, # probe.stl"
+
+
+def test_nothing_is_asked_where_nothing_may_be_written(block: Path) -> None:
+    make_experiment(block / "new", sources(block), KNOWN)
+    with pytest.raises(InputError, match="there are results already"):
+        make_experiment(block / "new", sources(block), {}, ask=lambda question, default: pytest.fail("it asked"))
+
+
+def test_the_progress_bar_is_away_while_a_question_stands(block: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It was drawn over the questions ten times a second."""
+    bars: list[bool] = []
+
+    class Terminal(io.StringIO):
+        def isatty(self) -> bool:
+            return True
+
+    with Progress(Terminal()) as progress:
+        live = progress._bar.live
+        monkeypatch.setattr("typer.prompt", lambda question, default: bars.append(live.is_started) or "answer")
+        monkeypatch.setattr("sys.stdin", Terminal())
+        assert _asks(progress, True) is None
+        ask = _asks(progress, False)
+        assert ask is not None and live.is_started
+        assert ask("What?", None) == "answer"
+        assert live.is_started and bars == [False]
 
 
 @pytest.mark.parametrize("text", ["ball:0.01", "cylinder:0.01,0.03", "box:0.02,0.015,0.04"])

@@ -261,6 +261,21 @@ EXPERIMENTS: dict[str, Change] = {
     "a section mistyped": renamed("phantom", "phantm"),
     "a parameter mistyped": effect("stiffness", ration=1.2),
     "threshold of 5 m": key("thresholds.error", 5.0),
+    "threshold of 2 mm in mm": key("thresholds.error", 2.0),
+    "lesion in mm": key("phantom.lesions", [{"name": "t", "centre": [0.0, 0.0, 0.015], "diameter": 2.0}]),
+    "sigma of a marker in mm": both(
+        table("id,x,y,z", "id,x,y,z,sigma"), table("1,-0.016,-0.016,0.03", "1,-0.016,-0.016,0.03,0.5")),
+    "ball in mm": key("probe", {"shape": {"sphere": 2.0}}),
+    "cylinder in mm": key("probe", {"shape": {"cylinder": [1.5, 0.04]}}),
+    "box in mm": key("probe", {"shape": {"box": [0.6, 2.0, 2.0]}}),
+    "inclusion beside the body": effect("inclusion", centre=[0.0, 0.1, 0.025], radius=0.006, ratio=5.0),
+    "inclusion's centre in mm": effect("inclusion", centre=[0.0, 10.0, 25.0], radius=0.006, ratio=5.0),
+    "inclusion's radius in mm": effect("inclusion", centre=[0.0, 0.0, 0.015], radius=6.0, ratio=5.0),
+    "skin in mm": effect("skin", thickness=2.0, ratio=5.0),
+    "probe's offset in mm": effect("probe_offset", translation=[0.0, 0.0, 1.0]),
+    "cameras' motion in mm": effect("camera_motion", translation=[0.0, 2.0, 0.0], rotation=[0.0] * 3, onset=0.0),
+    "rest off by millimetres in mm": effect("reference_pose", translation=[3.0, 0.0, 0.0], rotation=[0.0] * 3),
+    "warming without a temperature": effect("thermal_expansion", alpha=3e-4),
     "a column of markers.csv twice": table("id,x,y,z", "id,x,y,x,z"),
     "a line of markers.csv too long": table("1,-0.016,-0.016,0.03", "1,-0.016,-0.016,0.03,0,0,0,0"),
     "an id of markers.csv twice": table("2,-0.016,0,0.03", "1,-0.016,0,0.03"),
@@ -268,7 +283,22 @@ EXPERIMENTS: dict[str, Change] = {
 }  # fmt: skip
 """Changes of an experiment; all must be refused when it is loaded."""
 
+LARGE: dict[str, Change] = {
+    "plate of 0.4 m": key("probe", {"shape": {"box": [0.4, 0.4, 0.01]}}),
+    "threshold as large as the body": key("thresholds.error", 0.04),
+    "lesion as large as the body": key(
+        "phantom.lesions", [{"name": "t", "centre": [0.0, 0.0, 0.015], "diameter": 0.04}]
+    ),
+    "inclusion beyond the body": effect("inclusion", centre=[0.0, 0.0, 0.015], radius=0.08, ratio=5.0),
+    "inclusion that reaches in": effect("inclusion", centre=[0.0, 0.0, 0.035], radius=0.01, ratio=5.0),
+    "skin as thick as the body": effect("skin", thickness=0.04, ratio=5.0),
+    "tool 0.3 m long": effect("probe_offset", translation=[0.0, 0.0, 0.3]),
+}
+"""Changes of an experiment that are large, but can be; none may be refused."""
+
 RECORDINGS: dict[str, Change] = {
+    "modulus in kPa of a soft body": key("phantom.material.youngs_modulus", 25.0),
+    "tilt of 2 degrees in degrees": effect("gravity_tilt", angle_x=2.0, angle_y=0.0),
     "markers without ids": lambda case: setattr(case, "with_ids", False),
     "ids of another experiment": frames(relabelled(100)),
     "some ids of another experiment": frames(

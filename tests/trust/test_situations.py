@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 import situations
-from situations import EXPERIMENTS, PAIRS, RECORDINGS, judged, judged_pair
+from situations import EXPERIMENTS, LARGE, PAIRS, RECORDINGS, judged, judged_pair
 
 from livedeform.common.bags.read import read_bag
 from livedeform.common.bags.recording import load_recording
@@ -20,6 +20,14 @@ def test_an_experiment_that_cannot_be_is_refused(name: str, tmp_path: Path):
     word, text = judged(name, tmp_path)
     assert word == "refused", text
     assert text.count("\n") == 0 and str(tmp_path) in text
+
+
+@pytest.mark.parametrize("name", LARGE)
+def test_what_is_large_but_can_be_is_loaded(name: str, tmp_path: Path):
+    case = situations.sound(tmp_path)
+    LARGE[name](case)
+    case.write()
+    load_experiment(case.experiment)
 
 
 @pytest.mark.parametrize("name", RECORDINGS)

@@ -4,18 +4,30 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
+from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from livedeform.commands.options import Force
 
+if TYPE_CHECKING:
+    from livedeform.progress import Progress
+
+
+class LengthUnit(StrEnum):
+    """A unit that a file may be in."""
+
+    M = "m"
+    MM = "mm"
+
+
 Folder = Annotated[Path, typer.Argument(metavar="FOLDER", help="The new experiment's folder.")]
 Surface = Annotated[Path, typer.Option(help="The body's closed surface: STL, OBJ or PLY.")]
 Markers = Annotated[Path, typer.Option(help="Markers at rest: a table id,x,y,z (.csv), a take (.c3d) or a recording.")]
-Unit = Annotated[str | None, typer.Option(help="Unit of the surface file, m or mm; told by its size.")]
-MarkersUnit = Annotated[str | None, typer.Option(help="Unit of the table, m or mm; told by what fits.")]
+Unit = Annotated[LengthUnit | None, typer.Option(help="Unit of the surface file, m or mm; told by its size.")]
+MarkersUnit = Annotated[LengthUnit | None, typer.Option(help="Unit of the table, m or mm; told by what fits.")]
 Rest = Annotated[str, typer.Option(help="Seconds of a take or recording in which nothing moves.")]
 Place = Annotated[
     list[str] | None,
@@ -95,7 +107,7 @@ def new(
     given = {name: context.params[name] for name in ANSWERED}
     sources = Sources(surface, markers, unit, markers_unit, parse_span(rest), read_places_of(place or []))
     with Progress() as progress:
-        lines = make_experiment(folder, sources, given, ask=None if yes else _asks(), force=force, tell=progress)
+        lines = make_experiment(folder, sources, given, ask=_asks(progress, yes), force=force, tell=progress)
     typer.echo("\n".join([*lines, _next(folder)]))
 
 
@@ -104,10 +116,12 @@ def _next(folder: Path) -> str:
     return f"look at it: livedeform view {folder}; then record, and: livedeform info BAG --experiment {folder}"
 
 
-def _asks() -> Callable[[str, str | None], str] | None:
-    """Return what asks a question on the terminal; None where there is none."""
-    return _ask if sys.stdin.isatty() else None
+def _asks(progress: Progress, yes: bool) -> Callable[[str, str | None], str] | None:
+    """Return what asks a question on the terminal, without the progress; None where there is none, or nothing is to be
+    asked (``yes``)."""
 
+    def ask(question: str, default: str | None) -> str:
+        with progress.paused():
+            return str(typer.prompt(question, default=default))
 
-def _ask(question: str, default: str | None) -> str:
-    return str(typer.prompt(question, default=default))
+    return ask if sys.stdin.isatty() and not yes else None

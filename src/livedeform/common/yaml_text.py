@@ -80,5 +80,19 @@ def _refuse_large(root: yaml.Node, where: str) -> None:
     size(root, 0)
 
 
+def refuse_octal(node: yaml.Node | None, where: str) -> None:
+    """Raise ``InputError`` for a number with leading zeros, which YAML reads to the base 8: 04000 is 2048."""
+    if isinstance(node, yaml.ScalarNode):
+        digits = node.value.replace("_", "").lstrip("+-")
+        if node.tag == INTEGER and digits.isdigit() and digits[0] == "0" and int(digits, 8) != int(digits):
+            what = f"{node.value} begins with a zero, and is read as {int(digits, 8)}, to the base 8"
+            remedy = "leave the zero out, or put quotes around a name"
+            raise InputError(what, where=f"{where}:{node.start_mark.line + 1}", remedy=remedy)
+    elif node is not None:
+        for item in node.value:
+            for part in item if isinstance(item, tuple) else (item,):
+                refuse_octal(part, where)
+
+
 def _too_deep(where: str) -> InputError:
     return InputError(f"is nested more than {MAX_DEPTH} deep", where=where, remedy="look at brackets and indentation")

@@ -11,14 +11,16 @@ import numpy as np
 
 from livedeform.common.errors import InputError
 from livedeform.common.experiment.markers_file import write_markers
+from livedeform.common.experiment.schema import Markers
 from livedeform.common.experiment.yaml_file import FILE_NAME, json_schema, load_experiment
 from livedeform.common.types import Array
-from livedeform.new.body import read_new_body
+from livedeform.new.body import NewBody, read_new_body
+from livedeform.new.inspected import inspected
 from livedeform.new.markers import fit_note, read_places
 from livedeform.new.picture import draw
 from livedeform.new.questions import Answers, Ask, answered, questions
 from livedeform.new.writing import experiment_text
-from livedeform.outputs import prepared, write_json, write_text
+from livedeform.outputs import checked, prepared, write_json, write_text
 
 MARKERS, SCHEMA, PICTURE = "markers.csv", "experiment.schema.json", "experiment.png"
 
@@ -53,34 +55,43 @@ def make_experiment(
     ``given`` are the answers that are known already, by question; ``ask`` asks for the others (None: what has a safe
     default is assumed). ``InputError`` for what cannot be meant; then nothing is written.
     """
+    written = [FILE_NAME, MARKERS, SCHEMA, PICTURE]
+    checked(out, [*written, sources.surface.name], [sources.surface, sources.markers], force=force)  # before it asks
     tell("reading the surface and the markers")
     body = read_new_body(sources.surface, sources.surface_unit)
-    markers = read_places(
+    markers, note = read_places(
         sources.markers, body.surface, unit=sources.markers_unit, rest=sources.rest, places=sources.places or {}
     )
     answers = answered(questions(body, out), given, ask)
     cameras = answers["cameras"]
     copies = _copies(sources.surface, answers)
-    names = [FILE_NAME, MARKERS, SCHEMA, PICTURE, *copies.values()]
+    names = [*written, *copies.values()]
     text = experiment_text(
         answers, sources.surface.name, body.unit, None if cameras is None else [copies[Path(file)] for file in cameras]
     )
     with prepared(out, names, force=force, inputs=[*copies, sources.markers], alone=False) as draft:
-        for file, name in copies.items():
-            shutil.copyfile(file, draft / name)
-        write_markers(draft / MARKERS, markers)
-        write_text(draft / FILE_NAME, text)
-        write_json(draft / SCHEMA, json_schema())
-        experiment = load_experiment(draft)
+        _write(draft, copies, markers, text)
+        findings = inspected(draft, {**{name: file for file, name in copies.items()}, MARKERS: sources.markers})
         tell("drawing the body")
-        draw(experiment, draft / PICTURE)
+        draw(load_experiment(draft), draft / PICTURE)
+    assumed = [f"assumed: {'; '.join(answers.assumed)}"] if answers.assumed else []
+    sound = f"{out / FILE_NAME}: sound; {out / PICTURE} shows it"
+    of_markers = [f"read: {note}", f"markers: {fit_note(markers, body.surface)}"]
+    return [_said_of_body(body), *of_markers, *assumed, *findings, sound]
+
+
+def _write(draft: Path, copies: Mapping[Path, str], markers: Markers, text: str) -> None:
+    """Write all but the picture into a folder."""
+    for file, name in copies.items():
+        shutil.copyfile(file, draft / name)
+    write_markers(draft / MARKERS, markers)
+    write_text(draft / FILE_NAME, text)
+    write_json(draft / SCHEMA, json_schema())
+
+
+def _said_of_body(body: NewBody) -> str:
     size = " x ".join(f"{1e3 * s:.1f}" for s in body.size)
-    return [
-        f"body: {size} mm, the surface file is in {body.unit}",
-        f"markers: {fit_note(markers, body.surface)}",
-        *([f"assumed: {'; '.join(answers.assumed)}"] if answers.assumed else []),
-        f"{out / FILE_NAME}: sound; {out / PICTURE} shows it",
-    ]
+    return f"body: {size} mm, the surface file is in {body.unit}"
 
 
 def _copies(surface: Path, answers: Answers) -> dict[Path, str]:

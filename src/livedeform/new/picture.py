@@ -65,7 +65,7 @@ def draw(experiment: Experiment, path: Path) -> None:
             _draw_view(axes, experiment, body, view)
         figure.legend(*_legend(experiment), loc="outside lower center", ncols=6)
         size = " x ".join(f"{MM * s:.0f}" for s in body.upper - body.lower)
-        figure.suptitle(f"{experiment.name}: {size} mm, {len(experiment.markers.ids)} markers")
+        figure.suptitle(f"{experiment.name}: {size} mm, {len(experiment.markers.ids)} markers", parse_math=False)
         figure.savefig(path, dpi=130)
 
 

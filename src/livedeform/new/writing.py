@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
+
+import yaml
 
 from livedeform.new.questions import Answers
 
@@ -47,8 +49,7 @@ probe:  # its frame: origin in the middle of the contact face, +z out of it into
 """
 
 STEREO = """\
-stereo:
-{files}  pose: registered  # of the left camera: found from the markers at rest
+  pose: registered  # of the left camera: found from the markers at rest
   detector: {{type: blob}}  # blob | circle_grid | checkerboard | aruco | apriltag
 """
 
@@ -66,34 +67,45 @@ def experiment_text(answers: Answers, surface: str, unit: str, cameras: Sequence
     sigma, spread = answers["modulus_sigma"], answers["density_sigma"]
     said = {
         **{key: _number(value) for key, value in answers.values.items()},
-        "name": json.dumps(answers["name"]),
-        "surface": json.dumps(surface),
+        "name": _quoted(answers["name"]),
+        "surface": _quoted(surface),
         "unit": unit,
         "gravity": "[" + ", ".join(_number(x) for x in answers["gravity"]) + "]",
         "density_sigma": f"density_sigma: {_number(spread)}" if spread else "# density_sigma: 5.0",
         "modulus_sigma": f"youngs_modulus_sigma: {_number(sigma)}" if sigma else "# youngs_modulus_sigma: 500.0",
     }
-    parts = [HEAD, PHANTOM.format(**said)]
+    parts = [HEAD, _filled(PHANTOM, said)]
     if answers["probe"] is not None:
-        parts.append(PROBE.format(shape=json.dumps(answers["probe"]).replace('"', ""), **_of(said)))
+        (shape,) = answers["probe"].items()
+        parts.append(_filled(PROBE, said | {"shape": f"{{{shape[0]}: {_size(shape[1])}}}"}))
     if cameras is not None:
         sides = zip(("left", "right"), cameras, strict=False)
-        files = "".join(f"  {side}: {json.dumps(name)}\n" for side, name in sides)
-        parts.append(STEREO.format(files=files or "  # left, right: the recording's CameraInfo is used\n"))
-    parts.append(TAIL.format(**said))
-    return "".join(_aligned(line) for part in parts for line in part.splitlines())
+        files = "".join(f"  {side}: {_quoted(name)}\n" for side, name in sides)
+        parts += ["stereo:\n", files or "  # left, right: the recording's CameraInfo is used\n", _filled(STEREO, said)]
+    return "".join([*parts, _filled(TAIL, said)])
 
 
-def _aligned(line: str) -> str:
-    """Put the comment of a line of keys at ``COLUMN``."""
-    code, sign, comment = line.partition(" # ")
-    if not sign or not code.strip() or code.lstrip().startswith("#"):
-        return line + "\n"
-    return f"{code.rstrip():{COLUMN}} # {comment.strip()}\n"
+def _filled(template: str, said: Mapping[str, str]) -> str:
+    """Fill in a part, the comments of its keys at ``COLUMN``: what is filled in may hold whatever marks a comment."""
+    lines = []
+    for line in template.splitlines():
+        code, sign, comment = line.partition(" # ")
+        filled = code.format(**said).rstrip()
+        if not sign or not filled.strip() or filled.lstrip().startswith("#"):
+            lines.append(line.format(**said))
+        else:
+            lines.append(f"{filled:{COLUMN}} # {comment.format(**said).strip()}")
+    return "".join(f"{line}\n" for line in lines)
 
 
-def _of(said: dict[str, Any]) -> dict[str, str]:
-    return {key: said[key] for key in ("edge_radius", "friction")}
+def _quoted(text: str) -> str:
+    """A text in quotes, as YAML reads it back whatever it holds."""
+    return str(yaml.safe_dump(text, default_style='"', allow_unicode=True, width=float("inf"))).strip()
+
+
+def _size(value: Any) -> str:
+    """Write what follows a probe's shape: a number, several, or a file's name."""
+    return _quoted(value) if isinstance(value, str) else json.dumps(value)
 
 
 def _number(value: Any) -> str:

@@ -11,6 +11,7 @@ import numpy as np
 
 from livedeform.common import topics as t
 from livedeform.common.bags.recording import Recording, load_recording
+from livedeform.common.checks.declared import check_declared
 from livedeform.common.checks.exchanged import check_exchanged
 from livedeform.common.checks.finding import Finding, Severity, refuse_errors
 from livedeform.common.checks.probe_path import check_probe
@@ -28,13 +29,27 @@ SAME = 0.5  # share of equal poses from which two recordings are one
 
 
 def check_recording(recording: Recording, experiment: Experiment) -> list[Finding]:
-    """Everything that can be told from the recording's numbers, without its pictures."""
+    """Everything that can be told from the recording's numbers, without its pictures, and of what is declared."""
     body = read_body(experiment)
     checks: Sequence[Callable[[Recording, Experiment, Surface], list[Finding]]] = (
         check_faults, check_ids, check_inputs, check_stamps, check_gaps, check_places, check_exchanges,
         check_probe, check_release, check_drifts,
     )  # fmt: skip
-    return [finding for check in checks for finding in check(recording, experiment, body)]
+    found = [finding for check in checks for finding in check(recording, experiment, body)]
+    return [*found, *check_declared(experiment, body)]
+
+
+def check_named(recording: Recording, experiment: Experiment) -> list[Finding]:
+    """Say what lines of ``recordings`` declare of it; where there are lines and none fits, one may be mistyped."""
+    if not experiment.recordings:
+        return []
+    if said := experiment.overrides(recording.own_name):
+        text = "; ".join(override.text for override in said)
+        return [Finding("NOTE", f"declared of '{recording.own_name}' alone: {text}")]
+    named = list(experiment.recordings)
+    shown = ", ".join(named[:4]) + (f" and {len(named) - 4} more" if len(named) > 4 else "")
+    text = f"no line of recordings ({shown}) fits '{recording.own_name}': what is declared for all acts in it"
+    return [Finding("WARN", text, "correct the line's name, if one is meant for it")]
 
 
 def frames_of(recording: Recording) -> list[MarkerFrame]:
@@ -210,7 +225,8 @@ def load_checked(fit: Sequence[Path], test: Sequence[Path], experiment: Experime
                 "and not which point went where",
                 where=str(path), remedy="paint some markers, or import points with ids",
             )  # fmt: skip
-        findings = check_recording(recording, experiment.of_recording(recording.own_name))
+        acting = experiment.of_recording(recording.own_name)
+        findings = [*check_named(recording, experiment), *check_recording(recording, acting)]
         refuse_errors(findings, str(path))
         said = [finding.text for finding in findings if finding.level == "WARN"]
         loaded.append(replace(recording, warnings=[*recording.warnings, *said]))

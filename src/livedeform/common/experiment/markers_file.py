@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import csv
+from collections.abc import Sequence
+from difflib import SequenceMatcher
 from pathlib import Path
 
 import numpy as np
@@ -11,18 +13,52 @@ from livedeform.common.errors import InputError
 from livedeform.common.experiment.schema import Markers
 
 KINDS = ("surface", "internal", "support")
-REQUIRED = ("id", "x", "y", "z")
+REQUIRED, OPTIONAL = ("id", "x", "y", "z"), ("sigma", "kind")
+NEAR = 0.85  # of `SequenceMatcher`: kinds and kin are near to kind, sigma_x is not near to sigma
 
 
 def read_markers(path: Path) -> Markers:
-    """The markers of the file; ``InputError`` naming the line for anything that is not a marker."""
+    """The markers of the file; ``InputError`` naming the line for anything that is not a marker.
+
+    Columns go by their names, in small or capital letters; others than id, x, y, z, sigma and kind are not read.
+    """
     try:
         text = path.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"cannot be read ({error})", where=str(path), remedy="save it as UTF-8 text") from error
-    lines = [line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
-    rows = csv.DictReader(lines, skipinitialspace=True)
-    columns = [(name or "").strip() for name in rows.fieldnames or []]
+    lines = {i: line for i, line in enumerate(text.splitlines(), 1) if line.strip() and not _is_comment(line)}
+    rows = csv.DictReader(lines.values(), skipinitialspace=True)
+    rows.fieldnames = columns = _columns(rows.fieldnames or [], path)
+    numbers, places = list(lines), []  # of all lines, of those with a marker
+    parsed = []
+    for row in rows:
+        places.append(f"{path}:{numbers[rows.line_num - 1]}")
+        parsed.append(_parse(row, places[-1]))
+    if not parsed:
+        raise InputError("holds no markers", where=str(path), remedy="add one line per marker: id,x,y,z in metres")
+    ids = [row[0] for row in parsed]
+    for i, marker_id in enumerate(ids):
+        if marker_id in ids[:i]:
+            what = f"marker id {marker_id} is there twice"
+            raise InputError(what, where=places[i], remedy="give every marker its own id")
+    return Markers(
+        np.array(ids, np.uint32),
+        np.array([row[1] for row in parsed], float).reshape(-1, 3),
+        np.array([row[2] for row in parsed], float),
+        np.array([row[3] for row in parsed]),
+        kinds_stated="kind" in columns,
+    )
+
+
+def _is_comment(line: str) -> bool:
+    return line.lstrip().startswith("#")
+
+
+def _columns(names: Sequence[str], path: Path) -> list[str]:
+    """Return the names of the columns, those that are read in small letters."""
+    columns = [name.strip() for name in names]
+    read = [name for name in (*REQUIRED, *OPTIONAL) if name not in columns]  # these are there as they are
+    columns = [name.lower() if name.lower() in read else name for name in columns]
     missing = [name for name in REQUIRED if name not in columns]
     if missing:
         raise InputError(
@@ -33,24 +69,17 @@ def read_markers(path: Path) -> Markers:
     doubled = sorted({name for name in columns if name and columns.count(name) > 1})
     if doubled:
         raise InputError(f"column {', '.join(doubled)} is there twice", where=str(path), remedy="delete one of them")
-    rows.fieldnames = columns
-    parsed = [_parse(row, f"{path}:{i}") for i, row in enumerate(rows, start=2)]
-    if not parsed:
-        raise InputError("holds no markers", where=str(path), remedy="add one line per marker: id,x,y,z in metres")
-    ids = [row[0] for row in parsed]
-    for i, marker_id in enumerate(ids):
-        if marker_id in ids[:i]:
-            raise InputError(
-                f"marker id {marker_id} is there twice (again in data row {i + 1})",
-                where=str(path),
-                remedy="give every marker its own id",
-            )
-    return Markers(
-        np.array(ids, np.uint32),
-        np.array([row[1] for row in parsed], float).reshape(-1, 3),
-        np.array([row[2] for row in parsed], float),
-        np.array([row[3] for row in parsed]),
-    )
+    for wanted in OPTIONAL:
+        near = [name for name in columns if name != wanted and _mistyped(name.lower(), wanted)]
+        if near and wanted not in columns:
+            what = f"a column '{near[0]}' is not read"
+            raise InputError(what, where=str(path), remedy=f"call it {wanted} if that is meant, or else otherwise")
+    return columns
+
+
+def _mistyped(name: str, wanted: str) -> bool:
+    """Tell whether a name is the wanted one with letters exchanged, or with one too many or too few."""
+    return sorted(name) == sorted(wanted) or SequenceMatcher(None, name, wanted).ratio() > NEAR
 
 
 def no_markers() -> Markers:

@@ -8,12 +8,17 @@ from livedeform.common.errors import InputError
 from livedeform.common.experiment.schema import Experiment, Region
 from livedeform.common.experiment.surface import Surface, read_mesh_boundary, read_surface
 from livedeform.common.published_effects import impossible
+from livedeform.common.types import EffectValues
 
 SMALLEST_BODY = 0.003  # m
 LARGEST_BODY = 3.0  # m
 MAX_TETRAHEDRA = 5e6
 FAR_FRACTION = 0.25  # of the body's diagonal: a marker farther off is not carried by the body
 SUPPORT_REACH = 10.0  # markers on the support may be that much farther off
+TIMES_THE_BODY, LARGEST_BESIDE = 5.0, 0.5  # of the diagonal, m: plates are larger than what they press, and tools long
+LARGEST_FITTED = 0.1  # m; up to here a fit may make a region larger than a small body
+WITHIN, OUTSIDE = {"radius", "thickness"}, {"translation"}  # parameters of effects that are lengths, m
+NEXT_TO = 0.01  # of the diagonal: a box so near to the surface may meet the mesh's
 TETRAHEDRON_VOLUME = 1.0 / (6.0 * np.sqrt(2.0))  # of a regular one with edge 1
 
 
@@ -34,6 +39,7 @@ def check_geometry(experiment: Experiment) -> Surface:
     _check_element_size(experiment, surface)
     _check_markers(experiment, surface)
     _check_lesions(experiment, surface)
+    _check_lengths(experiment, surface)
     for i, support in enumerate(phantom.support):
         _check_region(experiment, surface, support.region, f"phantom.support.{i}.region")
         if support.region.contains(surface.vertices).all():
@@ -43,8 +49,7 @@ def check_geometry(experiment: Experiment) -> Surface:
                 remedy="regions are in metres, whatever phantom.unit is: 1 mm is 0.001",
             )
     for i, effect in enumerate(experiment.effects):
-        if wrong := impossible(effect.name, effect.values, height=float(surface.upper[2] - surface.lower[2])):
-            raise InputError(wrong, where=_where(experiment, f"effects.{i}"), remedy="correct the value")
+        _check_effect(experiment, surface, i, effect)
     for i, load in enumerate(experiment.loads):
         _check_region(experiment, surface, load.region, f"loads.{i}.region")
     return surface
@@ -154,8 +159,57 @@ def _check_lesions(experiment: Experiment, surface: Surface) -> None:
             )
 
 
+def _check_lengths(experiment: Experiment, surface: Surface) -> None:
+    """Refuse lengths that are millimetres by all likelihood: of what lies in the body, and of what presses on it."""
+    across = _across(surface)
+    lengths = [(f"phantom.lesions.{i}.diameter", x.diameter) for i, x in enumerate(experiment.lesions)]
+    lengths += [("thresholds.error", experiment.thresholds.error)]
+    sigmas = experiment.markers.sigmas[np.isfinite(experiment.markers.sigmas)]
+    if len(sigmas) and sigmas.max() > across:
+        _refuse_length(str(experiment.phantom.markers), "sigma", float(sigmas.max()), surface)
+    for key, length in lengths:
+        if length > across:
+            _refuse_length(_where(experiment, key), key.rpartition(".")[2], length, surface)
+    for key, sizes in [] if experiment.probe is None else experiment.probe.shape:
+        size = float(np.max(sizes)) if sizes and key != "mesh" else 0.0
+        if size > _far(surface):
+            _refuse_length(_where(experiment, f"probe.shape.{key}"), key, size, surface)
+
+
+def _check_effect(experiment: Experiment, surface: Surface, i: int, effect: EffectValues) -> None:
+    """Refuse values that this body cannot have, or that are millimetres by all likelihood."""
+    where, values = _where(experiment, f"effects.{i}"), effect.values
+    if wrong := impossible(effect.name, values, height=float(surface.upper[2] - surface.lower[2])):
+        raise InputError(wrong, where=where, remedy="correct the value")
+    for keys, most in ((WITHIN, max(_across(surface), LARGEST_FITTED)), (OUTSIDE, _far(surface))):
+        for key in keys & values.keys():
+            size = float(np.linalg.norm(values[key]))
+            if size > most:
+                _refuse_length(where, f"'{key}' of effect '{effect.name}'", size, surface)
+    if effect.name == "inclusion":
+        centre, radius = np.reshape(values["centre"], (1, 3)), float(values["radius"])
+        away = float(surface.distance(centre)[0]) - radius
+        if away > FAR_FRACTION * _across(surface) and not surface.contains(centre)[0]:
+            what = f"the effect 'inclusion' lies outside the body, {away:.3g} m from it"
+            raise InputError(what, where=where, remedy="give centre and radius in metres, in the surface file's frame")
+
+
+def _across(surface: Surface) -> float:
+    return float(np.linalg.norm(surface.upper - surface.lower))
+
+
+def _far(surface: Surface) -> float:
+    """Return the length (m) from which on something beside the body is in millimetres by all likelihood."""
+    return max(TIMES_THE_BODY * _across(surface), LARGEST_BESIDE)
+
+
+def _refuse_length(where: str, name: str, length: float, surface: Surface) -> None:
+    what = f"{name} is {length:.4g} m, but the body is {_across(surface):.3g} m across"
+    raise InputError(what, where=where, remedy="lengths are in metres: 2 mm is 0.002")
+
+
 def _check_region(experiment: Experiment, surface: Surface, region: Region, key: str) -> None:
-    """Refuses a region that the surface cannot reach; what it selects of the mesh is the solver's to check."""
+    """Refuses a region that the surface does not reach; what it selects of the mesh is the solver's to check."""
     z_min, z_max = surface.lower[2], surface.upper[2]
     if region.below_z is not None:
         misses, body = region.below_z < z_min, f"the body's lowest point is at z = {z_min:.4g}"
@@ -163,8 +217,11 @@ def _check_region(experiment: Experiment, surface: Surface, region: Region, key:
         misses, body = region.above_z > z_max, f"the body's highest point is at z = {z_max:.4g}"
     elif region.box is not None:
         lower, upper = np.array(region.box)
+        slack = NEXT_TO * _across(surface)
         misses = bool((lower > surface.upper).any() or (upper < surface.lower).any())
         body = f"the body lies between {_point(surface.lower)} and {_point(surface.upper)}"
+        if not misses and not surface.meets_box(lower - slack, upper + slack):
+            misses, body = True, f"the box lies inside its surface, or beside it, by more than {slack:.2g}"
     elif region.sphere is not None:
         away = float(surface.distance(np.array([region.sphere.centre]))[0])
         misses, body = away > region.sphere.radius, f"the surface is {away:.3g} m from its centre"
@@ -176,7 +233,9 @@ def _check_region(experiment: Experiment, surface: Surface, region: Region, key:
         body = f"the body is {np.abs(heights).min():.3g} m from the plane"
     if misses:
         raise InputError(
-            f"the region touches no part of the body: {body} m", where=_where(experiment, key), remedy="correct it"
+            f"the region touches no part of the body's surface: {body} m",
+            where=_where(experiment, key),
+            remedy="correct it",
         )
 
 

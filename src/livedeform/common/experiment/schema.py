@@ -7,12 +7,13 @@ physical quantity may have a companion ``<key>_sigma`` (one standard deviation),
 from __future__ import annotations
 
 import difflib
-from collections.abc import Mapping, Sequence
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,7 +40,14 @@ from livedeform.common.published_effects import EFFECT_PARAMETERS, KEEP_ONE, OPT
 from livedeform.common.types import Array, EffectValues, Ids
 
 SIGMA = "_sigma"
+USED_SIGMAS = (  # what a diagnosis takes as priors, and for how well a release is known
+    "phantom.density", "phantom.material.youngs_modulus", "phantom.material.poisson_ratio", "timeline.release",
+)  # fmt: skip
+SETTINGS = ("version", "clock_start_ns", "element_size", "error")  # numbers that nobody measures
 FLOAT_MAX = float(np.finfo(float).max)
+ABSOLUTE_ZERO, MOST_APART = -273.15, 200.0  # degrees; Celsius and kelvin beside each other are 273 apart
+LONGEST_STAMP = 30  # digits; no float holds those of a stamp in nanoseconds
+NUMBER = r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?"
 DEFAULT_GRAVITY = (0.0, 0.0, -9.81)
 
 
@@ -106,6 +114,16 @@ def _unit_quaternion(value: tuple[float, ...]) -> tuple[float, ...]:
     return value
 
 
+def as_number(value: Any) -> Any:
+    """Return the numbers that a text or a list of texts stands for, others as they are: 4e3 is a text in YAML 1.1."""
+    if isinstance(value, list | tuple):
+        return [as_number(item) for item in value]
+    if not isinstance(value, str) or not re.fullmatch(NUMBER, value):
+        return value
+    whole = value.lstrip("+-").isdigit() and len(value) < LONGEST_STAMP
+    return int(value) if whole else float(value)
+
+
 Number = Annotated[float, BeforeValidator(_not_bool), AllowInfNan(False)]
 Positive = Annotated[Number, Field(gt=0)]
 NonNegative = Annotated[Number, Field(ge=0)]
@@ -127,11 +145,15 @@ class Section(BaseModel):
     def _read(cls, data: Any, handler: ModelWrapValidatorHandler[Self]) -> Self:
         if not isinstance(data, Mapping):
             return handler(data)
-        values = dict(data)
+        values = {key: as_number(value) if cls._is_of_numbers(key) else value for key, value in data.items()}
         sigmas = {}
         for key in [k for k in values if isinstance(k, str) and k.endswith(SIGMA)]:
-            if key.removesuffix(SIGMA) in cls._quantities(values):
-                sigmas[key.removesuffix(SIGMA)] = _read_sigma(key, values.pop(key))
+            quantity = key.removesuffix(SIGMA)
+            if quantity in cls._quantities(values):
+                sigmas[quantity] = _read_sigma(key, values.pop(key))
+            elif quantity in values and quantity in cls.model_fields:
+                remedy = f"leave it out; a diagnosis uses those of {', '.join(USED_SIGMAS)}"
+                raise problem(f"'{quantity}' is no physical quantity, and has no standard deviation", remedy)
         known = cls._known(values)
         for key in values:
             if known is not None and key not in known:
@@ -139,6 +161,11 @@ class Section(BaseModel):
         section = handler(values)
         section._sigmas.update(sigmas)
         return section
+
+    @classmethod
+    def _is_of_numbers(cls, key: Any) -> bool:
+        """Return whether a key holds numbers: a field that does, a companion, or a setting of its own."""
+        return key not in cls.model_fields or "float" in str(cls.model_fields[key].annotation)
 
     @classmethod
     def _keys(cls) -> list[str]:
@@ -157,7 +184,7 @@ class Section(BaseModel):
     @classmethod
     def _quantities(cls, values: Mapping[str, Any]) -> list[str]:
         """The keys that may have a ``_sigma`` companion."""
-        return [k for k, v in values.items() if not isinstance(v, str | bool | Mapping)]
+        return [k for k, v in values.items() if k not in SETTINGS and _is_quantity(v)]
 
     @model_serializer(mode="wrap")
     def _write(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
@@ -174,13 +201,23 @@ class Section(BaseModel):
     def __get_pydantic_json_schema__(cls, core_schema: Any, handler: GetJsonSchemaHandler) -> dict[str, Any]:
         schema = handler.resolve_ref_schema(handler(core_schema))
         for key, entry in list(schema.get("properties", {}).items()):
-            if "number" in str(entry) and key != "version":
+            if "number" in str(entry) and key not in SETTINGS:
                 schema["properties"][key + SIGMA] = {
                     "type": "number",
                     "exclusiveMinimum": 0,
                     "description": f"one standard deviation of {key}",
                 }
         return schema
+
+
+AnySection = TypeVar("AnySection", bound=Section)
+
+
+def _is_quantity(value: Any) -> bool:
+    """A number or numbers in lists, which may be wrong; what has keys of its own, a name or nothing is none."""
+    if isinstance(value, list | tuple):
+        return bool(value) and all(_is_quantity(item) for item in value)
+    return not isinstance(value, str | bool | Mapping | BaseModel)
 
 
 def _read_sigma(key: str, value: Any) -> float:
@@ -606,16 +643,22 @@ class Temperature(Section):
         if listed == (self.file is not None) or (self.time is None) != (self.value is None):
             raise problem("a temperature is given by 'file', or by 'time' and 'value'", "give one of the two")
         if self.time is not None and self.value is not None:
-            check_curve(self.time, self.value)
+            check_curve(self.time, self.value, self.reference)
         return self
 
 
-def check_curve(time: Sequence[float], value: Sequence[float]) -> None:
-    """Raise a `problem` unless ``value`` is a curve over rising ``time``."""
+def check_curve(time: Sequence[float], value: Sequence[float], reference: float) -> None:
+    """Raise a `problem` unless ``value`` is a curve over rising ``time``, in the unit of ``reference``."""
     if len(time) != len(value) or not time:
         raise problem(f"{len(time)} times but {len(value)} temperatures", "give one temperature per time")
     if any(b <= a for a, b in pairwise(time)):
         raise problem("the times do not rise", "sort them, each once")
+    if min(*value, reference) < ABSOLUTE_ZERO:
+        raise problem(f"{min(*value, reference):g} degrees Celsius is below absolute zero", "correct the temperature")
+    apart = max(value, key=lambda degrees: abs(degrees - reference))
+    if abs(apart - reference) > MOST_APART:
+        what = f"a temperature of {apart:g} is {abs(apart - reference):g} degrees from the reference {reference:g}"
+        raise problem(what, "give all in degrees Celsius, or all in kelvin")
 
 
 class Thresholds(Section):
@@ -636,7 +679,7 @@ def _read_effect(value: Any, info: ValidationInfo) -> Any:
     if name not in known:
         raise problem(f"unknown effect '{name}'", did_you_mean(name, list(known)))
     sizes = {**known[name], **OPTIONAL_PARAMETERS.get(name, {})}
-    parameters = {k: v for k, v in value.items() if k != "name"}
+    parameters = {k: as_number(v) for k, v in value.items() if k != "name"}
     values: dict[str, Array] = {}
     sigmas: dict[str, Array] = {}
     for key, entry in parameters.items():
@@ -687,6 +730,14 @@ def _each_once(effects: tuple[EffectValues, ...]) -> tuple[EffectValues, ...]:
     return effects
 
 
+def _named(recordings: dict[str, Override]) -> dict[str, Override]:
+    """Refuse a name that no recording can have: a name is no path."""
+    for pattern in recordings:
+        if "/" in pattern:
+            raise problem(f"'{pattern}' is a path", "write the recording's own name, without its folders")
+    return recordings
+
+
 Effect = Annotated[
     EffectValues,
     BeforeValidator(_read_effect),
@@ -703,13 +754,14 @@ class Markers:
     """Reference markers, in the surface file's configuration.
 
     ``ids`` (n,); ``points`` (n, 3) m; ``sigmas`` (n,) m, NaN where the file gives none; ``kinds`` (n,) surface,
-    internal or support ("surface" where the file gives none).
+    internal or support ("surface" where the file gives none); ``kinds_stated``: it has a column of kinds.
     """
 
     ids: Ids
     points: Array
     sigmas: Array
     kinds: NDArray[np.str_]
+    kinds_stated: bool = False
 
 
 class Experiment(Section):
@@ -729,9 +781,9 @@ class Experiment(Section):
     """Forces that act besides the body's weight."""
     timeline: Timeline = Timeline()
     """When gravity and loads begin to act."""
-    recordings: dict[str, Override] = {}
+    recordings: Annotated[dict[str, Override], AfterValidator(_named)] = {}
     """What acts otherwise in some recordings: {NAME or GLOB: {loads: [..], gravity: [..], release: s}}. A recording's
-    name is its file's without .mcap, or its folder's; of several that fit, the later line decides."""
+    name is its file's, with or without .mcap, or its folder's; of several that fit, the later line decides."""
     temperature: Temperature | None = None
     """How warm the body is over time; needed for thermal_expansion."""
     effects: Annotated[tuple[Effect, ...], AfterValidator(_each_once)] = ()
@@ -754,6 +806,11 @@ class Experiment(Section):
             raise problem(
                 f"'{parameter}' of effect '{name}' acts only where a body is let go",
                 "leave it out, or give timeline.release",
+            )
+        if self.temperature is None and any(effect.name == "thermal_expansion" for effect in self.effects):
+            raise problem(
+                "effect 'thermal_expansion' needs to know how warm the body was",
+                "declare 'temperature', or leave the effect out",
             )
         return self
 
@@ -797,10 +854,18 @@ class Experiment(Section):
     def of_recording(self, name: str) -> Experiment:
         """The same experiment with what acts in the recording of that name declared for all."""
         out = self
-        for pattern, override in self.recordings.items():
-            if fnmatchcase(name, pattern):
-                out = out.under(override)
+        for override in self.overrides(name):
+            out = out.under(override)
         return out
+
+    @property
+    def sigmas(self) -> dict[str, float]:
+        """Every standard deviation that the file gives, by the quantity's key with dots."""
+        return dict(_sigmas_in(self, ""))
+
+    def overrides(self, name: str) -> list[Override]:
+        """Return what is said of the recording of that name, the last to decide last; empty where no line fits it."""
+        return [said for key, said in self.recordings.items() if fnmatchcase(name, key.removesuffix(".mcap"))]
 
     @property
     def acting(self) -> Override:
@@ -813,11 +878,32 @@ class Experiment(Section):
         if acting.loads is not None:
             update["loads"] = acting.loads
         if acting.gravity is not None:
-            update["phantom"] = self.phantom.model_copy(update={"gravity": acting.gravity})
+            update["phantom"] = _with(self.phantom, "gravity", acting)
         if acting.release is not None:
-            update["timeline"] = self.timeline.model_copy(update={"release": acting.release})
+            update["timeline"] = _with(self.timeline, "release", acting)
         return self.model_copy(update=update) if update else self
 
     def with_effects(self, effects: Sequence[EffectValues]) -> Experiment:
         """The same experiment with another list of effects."""
         return self.model_copy(update={"effects": tuple(effects)})
+
+
+def _with(section: AnySection, key: str, said: Section) -> AnySection:
+    """Return a section with what another says of a key, and with its standard deviation where one is given."""
+    out = section.model_copy(update={key: getattr(said, key)})
+    out._sigmas = section._sigmas | {k: sigma for k, sigma in said._sigmas.items() if k == key}
+    return out
+
+
+def _sigmas_in(value: Any, place: str) -> Iterator[tuple[str, float]]:
+    """Give the standard deviations of a section and of all in it."""
+    parts: Iterable[tuple[Any, Any]] = ()
+    if isinstance(value, Section):
+        yield from ((f"{place}{key}", sigma) for key, sigma in value._sigmas.items())
+        parts = value
+    elif isinstance(value, Mapping):
+        parts = value.items()
+    elif isinstance(value, tuple):
+        parts = enumerate(value)
+    for key, part in parts:
+        yield from _sigmas_in(part, f"{place}{key}.")

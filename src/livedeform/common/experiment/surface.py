@@ -71,6 +71,17 @@ class Surface:
             inside[i] = np.arctan2(numerator, denominator).sum() / (2.0 * np.pi) > 0.5
         return inside
 
+    def meets_box(self, lower: Array, upper: Array) -> bool:
+        """Return whether a triangle reaches into the box between two corners (3,) m: no axis parts them (Akenine-Moller
+        2001)."""
+        middle, half, corners = (lower + upper) / 2.0, (0.5 + 1e-9) * (upper - lower), self.corners
+        corners = corners[((corners.min(axis=1) <= upper) & (corners.max(axis=1) >= lower)).all(axis=1)] - middle
+        edges = np.roll(corners, -1, axis=1) - corners
+        across = np.cross(edges[:, :, None], np.eye(3)).reshape(-1, 9, 3)
+        axes = np.concatenate([np.cross(edges[:, 0], edges[:, 1])[:, None], across], axis=1)
+        along, reach = np.einsum("kcj,kaj->kac", corners, axes), np.abs(axes) @ half
+        return bool(((along.min(axis=2) <= reach) & (along.max(axis=2) >= -reach)).all(axis=1).any())
+
 
 def read_surface(path: Path, unit: str = "m") -> Surface:
     """The closed surface in an STL, OBJ or PLY file, scaled to metres; ``MeshError`` if it is not closed.

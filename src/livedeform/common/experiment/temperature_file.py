@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import math
 from pathlib import Path
 
 from pydantic_core import PydanticCustomError
@@ -16,14 +17,15 @@ COLUMNS = ("time", "temperature")
 def read_temperatures(section: Temperature) -> tuple[tuple[float, ...], tuple[float, ...]]:
     """Return times (k,) s and temperatures (k,) of the section's lists, or of its file.
 
-    Raises ``InputError`` naming the line for anything that is no number, and for times that do not rise.
+    Raises ``InputError`` naming the line for anything that is no number, for times that do not rise, and for units that
+    differ.
     """
     if section.file is None:
         return section.time or (), section.value or ()
     rows = _rows(section.file)
     time, value = tuple(row[0] for row in rows), tuple(row[1] for row in rows)
     try:
-        check_curve(time, value)
+        check_curve(time, value, section.reference)
     except PydanticCustomError as error:
         context = error.context or {}
         raise InputError(context["what"], where=str(section.file), remedy=context["remedy"]) from error
@@ -50,6 +52,8 @@ def _rows(path: Path) -> list[tuple[float, float]]:
 def _row(cells: list[str], places: list[int], where: str) -> tuple[float, float]:
     try:
         time, value = (float(cells[place]) for place in places)
+        if not (math.isfinite(time) and math.isfinite(value)):
+            raise ValueError
     except (ValueError, IndexError) as error:
         raise InputError(
             f"'{','.join(cells)}' is not a time and a temperature", where=where, remedy="correct the line or delete it"

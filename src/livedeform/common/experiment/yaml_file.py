@@ -34,7 +34,7 @@ from livedeform.common.experiment.schema import (
 )
 from livedeform.common.experiment.temperature_file import read_temperatures
 from livedeform.common.types import EffectValues
-from livedeform.common.yaml_text import parse_yaml
+from livedeform.common.yaml_text import parse_yaml, refuse_octal
 
 __all__ = [
     "Experiment",
@@ -157,7 +157,8 @@ def _relative(document: dict[str, Any], folder: Path) -> dict[str, Any]:
 
 
 def _parse(file: Path) -> tuple[yaml.Node, Any]:
-    """The YAML tree with line numbers, and its value; syntax errors and doubled keys are refused."""
+    """The YAML tree with line numbers, and its value; syntax errors, doubled keys and octal
+    numbers are refused."""
     if not file.is_file():
         raise InputError(
             "the experiment does not exist", where=str(file), remedy=f"name a folder that holds {FILE_NAME}"
@@ -171,6 +172,7 @@ def _parse(file: Path) -> tuple[yaml.Node, Any]:
     if not isinstance(node, yaml.MappingNode) or not isinstance(document, dict):
         raise InputError("is not a mapping of keys", where=str(file), remedy="begin with 'version: 1'")
     _refuse_doubled_keys(node, file)
+    refuse_octal(node, str(file))
     return node, document
 
 
