@@ -105,6 +105,7 @@ def read_inputs(
     error = _discretisation_error(body, evidence, known, processes, settings, tell)
     # 6. what is uncertain whatever is tried
     uncertain = _uncertain(experiment, body.setting.mesh, rest, known, error, settings.allowance)
+    uncertain = replace(uncertain, release=_release_sigma(experiment, recordings))
     return Inputs(
         fitted=evidence.fitted,
         held_out=evidence.held_out,
@@ -282,8 +283,13 @@ def _uncertain(
     sideways = _offset_of(mesh, settings) if model is None else model.offset
     always = _always(known, _like_mesh(known), sideways)
     errors = _model_errors(experiment, rest, model, settings)
-    release = experiment.sigma("timeline.release") or 0.0
-    return Uncertain(errors, shift, turn, always, Correction() if model is None else model.correction, release)
+    return Uncertain(errors, shift, turn, always, Correction() if model is None else model.correction)
+
+
+def _release_sigma(experiment: Experiment, recordings: Mapping[str, Recording]) -> float:
+    """Return the sigma (s) of when a body was let go, the largest that is stated of any recording; 0 where none is."""
+    each = (experiment.of_recording(r.own_name).sigma("timeline.release") for r in recordings.values())
+    return max((sigma for sigma in each if sigma is not None), default=0.0)
 
 
 def _model_errors(

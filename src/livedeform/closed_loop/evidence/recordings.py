@@ -50,7 +50,7 @@ def read_evidence(
     for number, (name, recording) in enumerate(recordings.items()):
         n_moments = sampling.moments_fit if number < n_fit else sampling.moments_test
         acting = experiment.of_recording(recording.own_name)
-        release, sigma = acting.timeline.release, experiment.sigma("timeline.release") or 0.0
+        release, sigma = acting.timeline.release, acting.sigma("timeline.release") or 0.0
         if release > 0.0:
             n_moments = max(n_moments, sampling.moments_swing)
         frames, note = marker_frames(experiment, recording, rest, settings.sampling, tell)
