@@ -48,6 +48,7 @@ def build_world(spec: Mapping[str, Any]) -> tuple[World, TruthProbe]:
     if kind not in SHAPES:
         raise InputError(f"unknown body shape '{kind}'", where="body.shape", remedy=f"use {' or '.join(SHAPES)}")
     _refuse_balls(spec["body"], spec["truth"])
+    _refuse_unseen(spec)
     mesh = SHAPES[kind](spec["body"])
     physics = TruthPhysics(
         float(declared["youngs_modulus"]), float(declared["poisson_ratio"]), float(declared["density"]),
@@ -72,6 +73,18 @@ def _refuse_balls(body: Mapping[str, Any], truth: Sequence[Mapping[str, Any]]) -
         ):
             remedy = "give body: ball: the effect's centre and radius"
             raise InputError("no elements end at this sharp edge", where="truth", remedy=remedy)
+
+
+def _refuse_unseen(spec: Mapping[str, Any]) -> None:
+    """Raise InputError for an effect that would be in the truth, and in nothing that is recorded."""
+    if all(effect["name"] != "refraction" for effect in spec["truth"]):
+        return
+    if spec["measuring"]["kind"] == "pictures":
+        what, remedy = "pictures show no internal markers, and so no refraction", "use kind: markers, or leave it out"
+        raise InputError(what, where="truth: refraction", remedy=remedy)
+    if not spec["markers"]["internal"]:
+        what, remedy = "refraction acts on internal markers, and there are none", "ask for some: markers: internal"
+        raise InputError(what, where="truth: refraction", remedy=remedy)
 
 
 def _probe(shape: Mapping[str, Any], edge_radius: float) -> TruthProbe:
