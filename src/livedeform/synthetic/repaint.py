@@ -49,7 +49,7 @@ def repaint(
             )
         tell(f"recording {path.stem}", 0.0)
         painter = _painter(spec, truth["surface_rest"])
-        rng = np.random.default_rng(seed)
+        rng = scenario.generator(seed)
         stamps = {int(stamp): k for k, stamp in enumerate(truth["stamps_ns"])}
         x = np.zeros_like(painter.mesh.nodes)
         with (

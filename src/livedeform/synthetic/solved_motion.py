@@ -12,6 +12,7 @@ from scipy.interpolate import PchipInterpolator
 
 from livedeform.common.errors import InputError
 from livedeform.common.types import Array
+from livedeform.synthetic.checks.effect_values import check_effects, check_places
 from livedeform.synthetic.trajectory import CLEARANCE, Press, ProbePath, presses
 from livedeform.synthetic.true_effects import Warmth, World, apply_all
 from livedeform.synthetic.truth import hexmesh
@@ -50,6 +51,8 @@ def build_world(spec: Mapping[str, Any]) -> tuple[World, TruthProbe]:
     _refuse_balls(spec["body"], spec["truth"])
     _refuse_unseen(spec)
     mesh = SHAPES[kind](spec["body"])
+    check_effects(spec["truth"], height=float(np.ptp(mesh.nodes[:, 2])))
+    check_places(spec["truth"], mesh)
     physics = TruthPhysics(
         float(declared["youngs_modulus"]), float(declared["poisson_ratio"]), float(declared["density"]),
         friction=float(probe["friction"]),
@@ -57,7 +60,7 @@ def build_world(spec: Mapping[str, Any]) -> tuple[World, TruthProbe]:
     loaded = declared["configuration"] == "loaded"
     world = World(mesh, physics, scan_fraction=1.0 if loaded else 0.0, warmth=Warmth.of(spec["temperature"]))
     world = apply_all(world, spec["truth"])
-    return world, _probe(probe["shape"], float(probe["edge_radius"]))
+    return world, truth_probe(probe["shape"], float(probe["edge_radius"]))
 
 
 def _refuse_balls(body: Mapping[str, Any], truth: Sequence[Mapping[str, Any]]) -> None:
@@ -87,8 +90,27 @@ def _refuse_unseen(spec: Mapping[str, Any]) -> None:
         raise InputError(what, where="truth: refraction", remedy=remedy)
 
 
-def _probe(shape: Mapping[str, Any], edge_radius: float) -> TruthProbe:
-    """Return the probe of a scenario's ``probe.shape``: {kind: sizes in m}."""
+def refuse_misdeclared(spec: Mapping[str, Any], mesh: hexmesh.HexMesh) -> None:
+    """Raise InputError for lengths that this body cannot have been meant by, before it is solved."""
+    lower, upper = mesh.nodes.min(axis=0), mesh.nodes.max(axis=0)
+    most, element = float((upper - lower).max()) / 2.0, float(spec["declared"]["element_size"])
+    if element > most:
+        what, remedy = f"is {element:g} m, more than half of the body", f"give it in metres, below {most:.3g}"
+        raise InputError(what, where="declared.element_size", remedy=remedy)
+    for i, lesion in enumerate(spec["lesions"]):
+        centre = np.asarray(lesion["centre"], float)
+        if (centre < lower - 1e-9).any() or (centre > upper + 1e-9).any():
+            remedy = "give its centre in metres, in the body's frame"
+            raise InputError(f"lesion '{lesion['name']}' is outside the body", where=f"lesions.{i}", remedy=remedy)
+    for name, plan in spec["recordings"].items():
+        for i, press in enumerate(plan):
+            if press["depth"] >= upper[2] - lower[2]:
+                what, where = f"a press {press['depth']:g} m deep goes through the body", f"recordings.{name}.{i}.depth"
+                raise InputError(what, where=where, remedy="give it in metres: 4 mm is 0.004")
+
+
+def truth_probe(shape: Mapping[str, Any], edge_radius: float) -> TruthProbe:
+    """Return the probe of a scenario's ``probe.shape``, {kind: sizes in m}; InputError if there is none such."""
     kind, size = next(iter(shape.items())) if len(shape) == 1 else ("", ())
     sizes = np.atleast_1d(np.asarray(size, float))
     if len(sizes) != PROBE_SIZES.get(kind) or not (sizes > 0.0).all():
