@@ -172,6 +172,24 @@ def test_what_cannot_be_is_refused(key: str) -> None:
     assert word in refusal(changed(tuple(int(k) if k.isdigit() else k for k in key.split(".")), value))
 
 
+@pytest.mark.parametrize(
+    "name",
+    ["../../esc", "a/b", "/tmp/esc", "..", ".", "", ".hidden", "a\\b", "c:d", "a\nb", "a\0b", "ü" * 101, 1, None],
+)
+def test_a_recording_has_a_plain_name(name: Any, tmp_path: Path) -> None:
+    """What is made lies in --out: its bag and its truth are named after the recording."""
+    said = refusal(changed(("recordings",), {name: WHOLE["recordings"]["a"]}))
+    assert said.startswith("whole: recordings")
+    with pytest.raises(InputError):
+        scenario.make(changed(("recordings",), {name: WHOLE["recordings"]["a"]}), tmp_path / "in" / "out")
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("name", ["a", "b c", "take-01", "2026.03.01", "Übung", "a..b"])
+def test_usual_names_of_recordings_stay(name: str) -> None:
+    scenario.load(changed(("recordings",), {name: WHOLE["recordings"]["a"]}))
+
+
 @pytest.mark.parametrize("missing", ["at", "depth"])
 def test_a_press_says_what_it_lacks(missing: str) -> None:
     press = {key: value for key, value in WHOLE["recordings"]["a"][0].items() if key != missing}

@@ -33,7 +33,7 @@ from livedeform.synthetic.true_effects import known_effect
 
 MOST_HZ = 10_000.0
 LONGEST_STEP = 0.1  # m of the path between solved states
-LONGEST_NAME = 100  # characters of a recording's name, which is a folder's
+LONGEST_NAME = 200  # bytes of a name of a recording, which is that of a folder
 NOT_IN_NAMES = re.compile(r'[/\\:*?"<>|\x00-\x1f]')
 RIGHT_ANGLE = 90.0
 IN_WORDS = {  # what pydantic says of types of its own, and the remedy
@@ -58,7 +58,7 @@ def _not_bool(value: Any) -> Any:
 
 
 def _plain_name(name: str) -> str:
-    if not name or name.startswith(".") or len(name) > LONGEST_NAME or NOT_IN_NAMES.search(name):
+    if not name or name.startswith(".") or len(name.encode()) > LONGEST_NAME or NOT_IN_NAMES.search(name):
         raise problem(f"'{name}' is no name for a recording", "give a plain name of a folder, as a or take-01")
     return name
 
