@@ -196,6 +196,11 @@ def test_a_press_says_what_it_lacks(missing: str) -> None:
     assert f"recordings.a.0: key '{missing}' is missing" in refusal(changed(("recordings", "a"), [press]))
 
 
+@pytest.mark.parametrize(("surface", "support"), [(0, 0), (0, 2), (1, 0), (2, 0), (1, 1)])
+def test_too_few_markers_to_register_by_are_refused(surface: int, support: int) -> None:
+    assert "registered by three" in refusal(changed(("markers",), {"surface": surface, "support": support}))
+
+
 @pytest.mark.parametrize("name", [*EFFECTS, *OUTSIDE])
 def test_every_effect_of_a_truth_is_checked(name: str) -> None:
     """An effect with its values is right; with one mistyped, missing, of another size or twice it is not."""

@@ -26,6 +26,7 @@ from livedeform.common.experiment.schema import (
     did_you_mean,
     problem,
 )
+from livedeform.common.frames import MAKE_A_FRAME
 from livedeform.synthetic.checks.effect_values import check_effects
 from livedeform.synthetic.solved_motion import truth_probe
 from livedeform.synthetic.trajectory import CLEARANCE
@@ -150,6 +151,13 @@ class HowMany(Part):
     surface: Few
     internal: Few
     support: Annotated[Few, Field(le=4)]
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if self.surface + self.support < MAKE_A_FRAME:
+            what = f"{self.surface + self.support} markers on the surface and the support are too few"
+            raise problem(what, "cameras are registered by three or more: ask for more of them")
+        return self
 
 
 class OneLesion(Part):
