@@ -19,7 +19,6 @@ from livedeform.synthetic.truth.probe import TruthProbe
 BODIES: dict[str, dict[str, Any]] = {
     "block": {"shape": "block", "size": [0.05, 0.05, 0.03], "elements": [3, 3, 2]},
     "dome": {"shape": "hemi_ellipsoid", "semi_axes": [0.05, 0.05, 0.045], "elements": [4, 1]},
-    "slab": {"shape": "bent_slab", "size": [0.1, 0.05, 0.03], "radius": 0.1, "elements": [6, 3, 2]},
 }
 PROBES: dict[str, dict[str, Any]] = {
     "ball": {"shape": {"sphere": 0.03}},
