@@ -83,6 +83,9 @@ DOME_PRESSES: dict[str, Any] = {
     ],
 }
 
+# a corner of the block is outside of the dome: what pulls there pulls nothing
+ON_DOME: dict[str, dict[str, Any]] = {"tether": {"place": [-0.03, -0.02, 0.031]}}
+
 # name: values at 1 x noise; the first key is what a size scales (as a difference from where the effect vanishes)
 VISIBLE: dict[str, dict[str, Any]] = {
     "stiffness": {"ratio": 1.085},
@@ -239,7 +242,8 @@ def dome() -> list[Case]:
     seeds = iter(range(6000, 10**6))
     cases = [Case(f"dome-none-{k}", "none", (), 0.0, next(seeds), "dome") for k in range(12)]
     cases += [Case(f"dome-{n}-2x", "single", (sized(n, 2.0),), 2.0, next(seeds), "dome") for n in _numbered_first()]
-    cases += [Case(f"dome-{n}-2x", "outside", (sized(n, 2.0),), 2.0, next(seeds), "dome") for n in OUTSIDE]
+    outside = {name: sized(name, 2.0) | ON_DOME.get(name, {}) for name in OUTSIDE}
+    cases += [Case(f"dome-{n}-2x", "outside", (e,), 2.0, next(seeds), "dome") for n, e in outside.items()]
     return cases + [Case(f"dome-{n}-2x", "single", (sized(n, 2.0),), 2.0, next(seeds), "dome") for n in NUMBERED_LAST]
 
 

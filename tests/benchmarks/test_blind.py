@@ -32,6 +32,12 @@ def test_blind_cases_are_many_different_and_say_nothing_in_the_experiment() -> N
         scenario.load(spec)
 
 
+def test_every_effect_of_the_dome_s_cases_acts_on_the_dome() -> None:
+    """A tether at the block's corner pulled nothing of the dome, whose nodes are further away."""
+    for case in blind_cases.dome():
+        build_world(scenario.load(case.scenario()))
+
+
 def test_sizes_scale_the_distance_from_no_effect() -> None:
     assert blind_cases.sized("stiffness", 2.0)["ratio"] == pytest.approx(1.17)
     assert blind_cases.sized("poisson_ratio", 2.0)["value"] == pytest.approx(0.446)

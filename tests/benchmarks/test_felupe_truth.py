@@ -76,7 +76,8 @@ def test_a_weightless_block_pressed_by_a_plate_pushes_back_as_it_must() -> None:
     body = FelupeTruth(column(gravity=(0.0, 0.0, 0.0)), PLATE)
     probe = {"shape": {"box": [0.08, 0.08, 0.02]}, "edge_radius": 0.004, "friction": 0.0}
     plan = {"a": [{"at": [0.0, 0.0], "depth": 0.004}]}
-    spec = scenario.load({"name": "column", "body": {}, "probe": probe, "recordings": plan, "path_step": 0.004})
+    block = {"shape": "block", "size": [SIDE, SIDE, HEIGHT], "elements": [2, 2, 4]}
+    spec = scenario.load({"name": "column", "body": block, "probe": probe, "recordings": plan, "path_step": 0.004})
     path = planned_path(plan["a"], body.rest(), body.mesh, spec)
     states = body.recording(path, 0.0, spec, lambda fraction: None)
     deepest = int(np.argmin(states.force[:, 2]))

@@ -86,7 +86,7 @@ def place_markers(spec: Mapping[str, Any], mesh: hexmesh.HexMesh, x: Array, rig:
     shallow = inner[mesh.nodes[inner, 2] > 0.5 * mesh.nodes[:, 2].max()]
     shallow = shallow[_seen_from_above(x[shallow], x[np.unique(mesh.faces)], rig)]
     n_inner = int(spec["markers"]["internal"])
-    nodes = shallow[_spread(mesh.nodes[shallow], n_inner)] if n_inner else np.empty(0, np.int64)
+    nodes = shallow[_spread(mesh.nodes[shallow], n_inner)]
     half = np.ptp(mesh.nodes[:, :2], axis=0) / 2 + 0.010
     y = -half[1] * np.array([1.0, 1.0, 0.25, 0.25])
     corners = np.column_stack([half[0] * np.array([-0.8, 0.8, -1.05, 1.05]), y, np.zeros(4)])
@@ -117,6 +117,8 @@ def _height(surface: Array, place: Array) -> float:
 
 def _spread(points: Array, n: int) -> NDArray[np.int64]:
     """n of the points, each as far as possible from those before."""
+    if n == 0:
+        return np.empty(0, np.int64)
     if len(points) < n:
         raise InputError(f"only {len(points)} places are visible for {n} markers", remedy="ask for fewer markers")
     chosen = [int(np.argmin(np.linalg.norm(points - points.mean(0), axis=1)))]

@@ -55,12 +55,12 @@ def record(
                 _write_pose(bag, stamp, when - world.time_offset, recording, spec, world, rng)
                 continue
             x, T = recording.x(float(when)), trajectory(float(when))
+            clock = float(when) + (start - START_NS) * 1e-9
             if painter is not None:
-                for side, pixels in painter.pictures(x, T, int(rng.integers(2**31))):
+                for side, pixels in painter.pictures(x, T, clock, int(rng.integers(2**31))):
                     bag.picture(side, stamp, pixels)
                 happened.painted.append((x[painter.nodes].astype(np.float32), T))
             else:
-                clock = float(when) + (start - START_NS) * 1e-9
                 surface = None if world.measuring.index is None else markers.surface(x)
                 bag.markers(tracker.frame(stamp, clock, markers.places(x), markers.normals(x), T, surface))
             happened.markers.append(markers.places(x))
@@ -161,10 +161,12 @@ class ScenePainter:
         surface: Array = np.einsum("pa,pad->pd", self.weights, x[self.mesh.faces[self.faces]])
         return surface
 
-    def pictures(self, x: Array, T: Array, seed: int) -> list[tuple[str, NDArray[np.uint8]]]:
+    def pictures(self, x: Array, T: Array, clock: float, seed: int) -> list[tuple[str, NDArray[np.uint8]]]:
+        """Return each side and its picture (h, w) ``clock`` s after the first recording's start, of the nodes' places
+        ``x`` (n, 3) m and the probe at ``T`` (4, 4)."""
         points = np.vstack([self._surface(x), self.plate])
         probe = (self.probe[0] @ T[:3, :3].T + T[:3, 3], self.probe[1])
-        views = self.tracker.true.views()
+        views = self.tracker.rig_at(clock).views()
         return [
             (side, render.render(self.scene, points, probe, camera, T_view, seed + i))
             for i, (side, (camera, T_view)) in enumerate(zip(("left", "right"), views, strict=True))

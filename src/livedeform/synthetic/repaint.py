@@ -17,7 +17,7 @@ from livedeform.common.types import Array
 from livedeform.synthetic import scenario
 from livedeform.synthetic.body_markers import aimed_rig, place_markers
 from livedeform.synthetic.measuring.measure import Seen, Tracker
-from livedeform.synthetic.record import ScenePainter
+from livedeform.synthetic.record import START_NS, ScenePainter
 from livedeform.synthetic.solved_motion import build_truth
 from livedeform.synthetic.writing import ScenarioWriter
 
@@ -49,7 +49,7 @@ def repaint(
             )
         tell(f"recording {path.stem}", 0.0)
         painter = _painter(spec, truth["surface_rest"])
-        rng = np.random.default_rng(seed)
+        rng = scenario.generator(seed)
         stamps = {int(stamp): k for k, stamp in enumerate(truth["stamps_ns"])}
         x = np.zeros_like(painter.mesh.nodes)
         with (
@@ -62,7 +62,8 @@ def repaint(
                 elif raw.topic == PICTURES[0]:
                     k = stamps[raw.log_time_ns]
                     x[painter.nodes] = truth["surface"][k]
-                    for side, pixels in painter.pictures(x, truth["T_probe"][k], int(rng.integers(2**31))):
+                    clock = 1e-9 * (raw.log_time_ns - START_NS)
+                    for side, pixels in painter.pictures(x, truth["T_probe"][k], clock, int(rng.integers(2**31))):
                         writer.picture(side, raw.log_time_ns, pixels)
                     tell(f"recording {path.stem}", k / len(stamps))
     return out / "experiment"

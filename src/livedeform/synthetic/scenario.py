@@ -13,9 +13,11 @@ from typing import Any
 import numpy as np
 
 from livedeform.common.errors import InputError
+from livedeform.common.experiment.yaml_file import load_experiment
 from livedeform.common.types import Array
 from livedeform.common.yaml_text import parse_yaml
 from livedeform.synthetic.body_markers import BodyMarkers, aimed_rig, place_markers
+from livedeform.synthetic.checks.scenario_schema import check_scenario, refuse_doubled_keys
 from livedeform.synthetic.declare import Mesher, write_experiment
 from livedeform.synthetic.measuring.measure import Seen, Tracker
 from livedeform.synthetic.record import START_NS, ScenarioRecording, record
@@ -26,6 +28,7 @@ from livedeform.synthetic.solved_motion import (
     TruthSolver,
     build_world,
     planned_path,
+    refuse_misdeclared,
     scanned_nodes,
 )
 from livedeform.synthetic.trajectory import TURNS, ProbePath
@@ -75,32 +78,57 @@ def shipped() -> list[str]:
 
 def load(scenario: str | Path | Mapping[str, Any]) -> dict[str, Any]:
     """Read a scenario and fill in its defaults: a mapping, a YAML file, or the name of a shipped one."""
-    if isinstance(scenario, Mapping):
-        given: Any = dict(scenario)
-    else:
-        path = Path(scenario)
-        if not path.is_file():
-            shipped_file = files("livedeform.synthetic") / "scenarios" / f"{scenario}.yaml"
-            if not shipped_file.is_file():
-                raise InputError(
-                    f"there is no scenario '{scenario}'", remedy=f"name a YAML file, or one of {', '.join(shipped())}"
-                )
-            text = shipped_file.read_text()
-        else:
-            text = path.read_text()
-        _, given = parse_yaml(text, str(scenario))
-        if not isinstance(given, dict):
-            raise InputError("a scenario is a mapping", where=str(scenario), remedy="see the shipped scenarios")
+    given: Any = _numbers_read(dict(scenario) if isinstance(scenario, Mapping) else _read(scenario))
     known = {*DEFAULTS, "name", "body", "recordings"}
     unknown = set(given) - known
+    source = str(given.get("name", "scenario") if isinstance(scenario, Mapping) else scenario)
     if unknown or not {"name", "body", "recordings"} <= set(given):
-        what = f"unknown key '{sorted(unknown)[0]}'" if unknown else "name, body and recordings are needed"
-        raise InputError(what, where=str(given.get("name", scenario)), remedy=f"known keys: {', '.join(sorted(known))}")
-    full = {}
+        what = f"unknown key '{sorted(map(str, unknown))[0]}'" if unknown else "name, body and recordings are needed"
+        raise InputError(what, where=source, remedy=f"known keys: {', '.join(sorted(known))}")
+    full: dict[str, Any] = {}
     for key, default in DEFAULTS.items():
         value = given.get(key, default)
         full[key] = {**default, **value} if isinstance(default, dict) and isinstance(value, Mapping) else value
-    return {**full, **{key: given[key] for key in ("name", "body", "recordings")}}
+    full |= {key: given[key] for key in ("name", "body", "recordings")}
+    check_scenario(full, source)
+    return full
+
+
+def _read(scenario: str | Path) -> dict[Any, Any]:
+    """Return what is in a YAML file, or in a shipped scenario."""
+    path: Any = Path(scenario)
+    if not path.is_file():
+        path = files("livedeform.synthetic") / "scenarios" / f"{scenario}.yaml"
+        if not path.is_file():
+            remedy = f"name a YAML file, or one of {', '.join(shipped())}"
+            raise InputError(f"there is no scenario '{scenario}'", remedy=remedy)
+    try:
+        node, given = parse_yaml(path.read_text(encoding="utf-8"), str(scenario))
+    except UnicodeDecodeError as error:
+        raise InputError("is no text in UTF-8", where=str(scenario), remedy="save it as plain UTF-8 text") from error
+    if not isinstance(given, dict):
+        raise InputError("a scenario is a mapping", where=str(scenario), remedy="see the shipped scenarios")
+    refuse_doubled_keys(node, str(scenario))
+    return given
+
+
+def _numbers_read(value: Any) -> Any:
+    """Return a scenario with its texts that are numbers as numbers, but for names: YAML takes 1e-3 for a text."""
+    if isinstance(value, Mapping):
+        return {key: one if key == "name" else _numbers_read(one) for key, one in value.items()}
+    if isinstance(value, list):
+        return [_numbers_read(one) for one in value]
+    try:
+        return float(value) if isinstance(value, str) else value
+    except ValueError:
+        return value
+
+
+def generator(seed: int) -> np.random.Generator:
+    """Return the random numbers of a seed; InputError if it is negative."""
+    if seed < 0:
+        raise InputError(f"the seed {seed} is negative", where="seed", remedy="give 0 or more")
+    return np.random.default_rng(seed)
 
 
 def make(
@@ -119,11 +147,11 @@ def make(
     ``solver`` makes what solves the body: one folder of ``kept`` bodies for each.
     """
     tell = progress or (lambda text, fraction: None)
-    spec = load(scenario)
+    rng, spec = generator(seed), load(scenario)
     if spec["declared"]["ship_mesh"] and mesher is None:
         raise InputError("it ships a mesh, but nobody makes one", where="declared.ship_mesh", remedy="give a mesher")
-    rng = np.random.default_rng(seed)
     world, shape = build_world(spec)
+    refuse_misdeclared(spec, world.mesh)
     body = solver(world, shape)
     world = replace(world, mesh=body.mesh)
     scan = scanned_nodes(world, spec)
@@ -134,6 +162,7 @@ def make(
     folder = out / "experiment"
     folder.mkdir(parents=True, exist_ok=True)
     write_experiment(folder, spec, body.mesh, scan, markers, rig, world, tell, mesher)
+    load_experiment(folder)  # whatever is wrong with it is told before anything is recorded
     tracker = Tracker(rig, world.measuring, _seen(markers, spec["measuring"]), shape, rng)
     tracker.register(markers.places(rest_x), markers.normals(rest_x))
     (out / "truth").mkdir(exist_ok=True)
@@ -163,9 +192,12 @@ def _all_solved(
     if not known:
         tell("the body at rest", 0.0)
         known["rest"] = body.rest()
+    paths = {name: planned_path(plan, known["rest"], body.mesh, spec) for name, plan in spec["recordings"].items()}
+    if path is not None and any(p.contact is not None for p in paths.values()):  # others were kept under this key
+        path = path.with_stem(f"{path.stem}-clear")
+        known = dict(np.load(path)) if path.is_file() else {"rest": known["rest"]}
     clock, out = 0.0, {}
-    for name, plan in spec["recordings"].items():
-        trajectory = planned_path(plan, known["rest"], body.mesh, spec)
+    for name, trajectory in paths.items():
         if f"{name}.x" in known:
             states = KeyStates(*(known[f"{name}.{f.name}"].astype(float) for f in fields(KeyStates)))
         else:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any, Protocol
 
@@ -12,7 +12,8 @@ from scipy.interpolate import PchipInterpolator
 
 from livedeform.common.errors import InputError
 from livedeform.common.types import Array
-from livedeform.synthetic.trajectory import CLEARANCE, Press, ProbePath, presses
+from livedeform.synthetic.checks.effect_values import check_effects, check_places
+from livedeform.synthetic.trajectory import CLEARANCE, Press, ProbePath, presses, turned
 from livedeform.synthetic.true_effects import Warmth, World, apply_all
 from livedeform.synthetic.truth import hexmesh
 from livedeform.synthetic.truth.ball_mesh import block_round_ball
@@ -32,6 +33,8 @@ SHAPES: dict[str, Callable[[Mapping[str, Any]], hexmesh.HexMesh]] = {
     "bent_slab": lambda b: hexmesh.bent_slab(b["size"], b["elements"], float(b["radius"]), float(b.get("focus", 1.0))),
 }
 
+COARSE, FINE = 4, 16  # cuts of a face's side: to see whether a probe is clear, and to plan for one that is not
+SLACK = 0.5e-3  # m by which a probe may touch earlier than with its middle, and be less clear: 0.2 in the blind test
 PROBE_SIZES = {"box": 3, "cylinder": 2, "sphere": 1}  # how many sizes each shape of a probe has
 
 
@@ -48,7 +51,10 @@ def build_world(spec: Mapping[str, Any]) -> tuple[World, TruthProbe]:
     if kind not in SHAPES:
         raise InputError(f"unknown body shape '{kind}'", where="body.shape", remedy=f"use {' or '.join(SHAPES)}")
     _refuse_balls(spec["body"], spec["truth"])
+    _refuse_unseen(spec)
     mesh = SHAPES[kind](spec["body"])
+    check_effects(spec["truth"], height=float(np.ptp(mesh.nodes[:, 2])))
+    check_places(spec["truth"], mesh)
     physics = TruthPhysics(
         float(declared["youngs_modulus"]), float(declared["poisson_ratio"]), float(declared["density"]),
         friction=float(probe["friction"]),
@@ -56,7 +62,7 @@ def build_world(spec: Mapping[str, Any]) -> tuple[World, TruthProbe]:
     loaded = declared["configuration"] == "loaded"
     world = World(mesh, physics, scan_fraction=1.0 if loaded else 0.0, warmth=Warmth.of(spec["temperature"]))
     world = apply_all(world, spec["truth"])
-    return world, _probe(probe["shape"], float(probe["edge_radius"]))
+    return world, truth_probe(probe["shape"], float(probe["edge_radius"]))
 
 
 def _refuse_balls(body: Mapping[str, Any], truth: Sequence[Mapping[str, Any]]) -> None:
@@ -74,8 +80,39 @@ def _refuse_balls(body: Mapping[str, Any], truth: Sequence[Mapping[str, Any]]) -
             raise InputError("no elements end at this sharp edge", where="truth", remedy=remedy)
 
 
-def _probe(shape: Mapping[str, Any], edge_radius: float) -> TruthProbe:
-    """Return the probe of a scenario's ``probe.shape``: {kind: sizes in m}."""
+def _refuse_unseen(spec: Mapping[str, Any]) -> None:
+    """Raise InputError for an effect that would be in the truth, and in nothing that is recorded."""
+    if all(effect["name"] != "refraction" for effect in spec["truth"]):
+        return
+    if spec["measuring"]["kind"] == "pictures":
+        what, remedy = "pictures show no internal markers, and so no refraction", "use kind: markers, or leave it out"
+        raise InputError(what, where="truth: refraction", remedy=remedy)
+    if not spec["markers"]["internal"]:
+        what, remedy = "refraction acts on internal markers, and there are none", "ask for some: markers: internal"
+        raise InputError(what, where="truth: refraction", remedy=remedy)
+
+
+def refuse_misdeclared(spec: Mapping[str, Any], mesh: hexmesh.HexMesh) -> None:
+    """Raise InputError for lengths that this body cannot have been meant by, before it is solved."""
+    lower, upper = mesh.nodes.min(axis=0), mesh.nodes.max(axis=0)
+    most, element = float((upper - lower).max()) / 2.0, float(spec["declared"]["element_size"])
+    if element > most:
+        what, remedy = f"is {element:g} m, more than half of the body", f"give it in metres, below {most:.3g}"
+        raise InputError(what, where="declared.element_size", remedy=remedy)
+    for i, lesion in enumerate(spec["lesions"]):
+        centre = np.asarray(lesion["centre"], float)
+        if (centre < lower - 1e-9).any() or (centre > upper + 1e-9).any():
+            remedy = "give its centre in metres, in the body's frame"
+            raise InputError(f"lesion '{lesion['name']}' is outside the body", where=f"lesions.{i}", remedy=remedy)
+    for name, plan in spec["recordings"].items():
+        for i, press in enumerate(plan):
+            if press["depth"] >= upper[2] - lower[2]:
+                what, where = f"a press {press['depth']:g} m deep goes through the body", f"recordings.{name}.{i}.depth"
+                raise InputError(what, where=where, remedy="give it in metres: 4 mm is 0.004")
+
+
+def truth_probe(shape: Mapping[str, Any], edge_radius: float) -> TruthProbe:
+    """Return the probe of a scenario's ``probe.shape``, {kind: sizes in m}; InputError if there is none such."""
     kind, size = next(iter(shape.items())) if len(shape) == 1 else ("", ())
     sizes = np.atleast_1d(np.asarray(size, float))
     if len(sizes) != PROBE_SIZES.get(kind) or not (sizes > 0.0).all():
@@ -103,12 +140,12 @@ def scanned_nodes(world: World, spec: Mapping[str, Any]) -> Array:
 
 
 def planned_path(plan: list[Mapping[str, Any]], x: Array, mesh: hexmesh.HexMesh, spec: Mapping[str, Any]) -> ProbePath:
+    """Plan how the probe moves over the body's places ``x`` (n, 3) m at rest; InputError for a press beside it."""
     steps = [Press.of(p) for p in plan]
     half = (
         np.array(spec["probe"]["shape"].get("box", [0.02, 0.02])[:2]) / 2 if "box" in spec["probe"]["shape"] else None
     )
-    weights, faces, _ = hexmesh.surface_triangles(mesh, 4)
-    surface = np.einsum("pa,pad->pd", weights, x[mesh.faces[faces]])
+    surface = _surface(mesh, x, COARSE)
     heights = []
     for step in steps:
         reach = half if half is not None else np.full(2, 0.004)
@@ -116,7 +153,39 @@ def planned_path(plan: list[Mapping[str, Any]], x: Array, mesh: hexmesh.HexMesh,
         if not under.any():
             raise InputError(f"the press at {step.at} misses the body", where="recordings", remedy="press on the body")
         heights.append(float(surface[under, 2].max()))
-    return presses(steps, heights)
+    shape = truth_probe(spec["probe"]["shape"], float(spec["probe"]["edge_radius"]))
+    path = presses(steps, heights)
+    early = max(t - h for t, h in zip(_touched(steps, surface, shape), heights, strict=True))
+    if early <= SLACK and _clear(path, surface, shape) >= CLEARANCE - SLACK:
+        return path
+    return _clear_path(steps, heights, _surface(mesh, x, FINE), shape)
+
+
+def _surface(mesh: hexmesh.HexMesh, x: Array, cuts: int) -> Array:
+    """Return places (n, 3) m on the surface of the mesh with nodes at ``x``, each face's side cut so often."""
+    weights, faces, _ = hexmesh.surface_triangles(mesh, cuts)
+    places: Array = np.einsum("pa,pad->pd", weights, x[mesh.faces[faces]])
+    return places
+
+
+def _touched(steps: list[Press], surface: Array, probe: TruthProbe) -> list[float]:
+    """Return the heights (k,) m of the probe's origin at which it first touches in each press."""
+    return [probe.comes_down_to(surface, turned(step.tilt), np.array(step.at)) for step in steps]
+
+
+def _clear(path: ProbePath, surface: Array, probe: TruthProbe) -> float:
+    """Return how far, m, the probe at least is from the surface between presses."""
+    return min(float(probe.distance((surface - T[:3, 3]) @ T[:3, :3])[0].min()) for T in path.aloft())
+
+
+def _clear_path(steps: list[Press], heights: list[float], surface: Array, probe: TruthProbe) -> ProbePath:
+    """Plan presses of a probe that would not be clear of the ``surface`` (n, 3) m between them: each counts from where
+    it first touches, if that is above the ``heights`` (k,) m under its middle, and it moves over higher up."""
+    used = [t if t - h > SLACK else h for t, h in zip(_touched(steps, surface, probe), heights, strict=True)]
+    path = presses(steps, used)
+    lowest = max(probe.comes_down_to(surface, T[:3, :3], T[:2, 3], CLEARANCE) for T in path.aloft())
+    top = max(lowest, max(used) + CLEARANCE)
+    return replace(presses(steps, used, top=top), contact=top - CLEARANCE)
 
 
 @dataclass(frozen=True)
@@ -225,7 +294,8 @@ def solve_recording(
 def solved_times(physics: TruthPhysics, trajectory: ProbePath, top: float, spec: Mapping[str, Any]) -> Array:
     """Return the times (k,) s at which a body whose highest point at rest is at ``top`` m is solved."""
     every = float(spec["time_step"]) if has_clock(physics) else None
-    return trajectory.key_times(float(spec["path_step"]), top + CLEARANCE / 2, every, rubs=physics.rubs)
+    low = max(top, top if trajectory.contact is None else trajectory.contact) + CLEARANCE / 2
+    return trajectory.key_times(float(spec["path_step"]), low, every, rubs=physics.rubs)
 
 
 def has_clock(physics: TruthPhysics) -> bool:

@@ -15,12 +15,20 @@ CLEARANCE = 0.004  # m above the surface between presses
 # m from where a move begins: of a friction of 0.017 under 0.2 N, on a soft body, drag has turned after 0.3 mm
 TURNS = 0.05e-3 * 2.0 ** np.arange(6)
 
+ALOFT = 21  # poses on a move between two presses
+
+
+def turned(tilt: Sequence[float] | Array) -> Array:
+    """Return the probe's rotation (3, 3) in ``phantom``: it looks down save for the ``tilt`` (2,) rad."""
+    turn: Array = Rotation.from_rotvec([tilt[0], tilt[1], 0.0]).as_matrix() @ np.diag([1.0, -1.0, -1.0])
+    return turn
+
 
 @dataclass(frozen=True)
 class Press:
-    """One press: above ``at`` (x, y) m, ``depth`` m below the highest point there, ``hold`` s, then an optional
-    ``stroke``
-    (dx, dy) m sideways at depth, then back up. ``speed`` and ``retreat_speed`` m/s; ``tilt`` (about x, about y) rad."""
+    """One press: above ``at`` (x, y) m, ``depth`` m below the highest point there (or, where a wide or tilted probe
+    touches earlier, below where it first touches), ``hold`` s, then an optional ``stroke`` (dx, dy) m sideways at
+    depth, then back up. ``speed`` and ``retreat_speed`` m/s; ``tilt`` (about x, about y) rad."""
 
     at: tuple[float, float]
     depth: float
@@ -39,11 +47,15 @@ class Press:
 
 @dataclass(frozen=True)
 class ProbePath:
-    """Key poses: ``times`` (k,) s, ``positions`` (k, 3) m, ``tilts`` (k, 2) rad; min-jerk moves in between."""
+    """Key poses: ``times`` (k,) s, ``positions`` (k, 3) m, ``tilts`` (k, 2) rad; min-jerk moves in between.
+
+    ``contact``: height m of the origin from which on it may touch, where that is above the body; else None.
+    """
 
     times: Array
     positions: Array
     tilts: Array
+    contact: float | None = None
 
     @property
     def duration(self) -> float:
@@ -55,11 +67,23 @@ class ProbePath:
         span = self.times[k + 1] - self.times[k]
         s = float(np.clip((t - self.times[k]) / span if span > 0 else 1.0, 0.0, 1.0))
         s = s * s * s * (10.0 - 15.0 * s + 6.0 * s * s)
-        tilt = (1 - s) * self.tilts[k] + s * self.tilts[k + 1]
+        return self._between(k, s)
+
+    def _between(self, k: int, s: float) -> Array:
+        """Return T_phantom_probe (4, 4) at the fraction ``s`` of the way from key pose ``k`` to the next."""
         T = np.eye(4)
-        T[:3, :3] = Rotation.from_rotvec([tilt[0], tilt[1], 0.0]).as_matrix() @ np.diag([1.0, -1.0, -1.0])
+        T[:3, :3] = turned((1 - s) * self.tilts[k] + s * self.tilts[k + 1])
         T[:3, 3] = (1 - s) * self.positions[k] + s * self.positions[k + 1]
         return T
+
+    def aloft(self) -> list[Array]:
+        """Return poses (4, 4) on all moves and stays at the height between presses."""
+        high = self.positions[:, 2] == self.positions[:, 2].max()
+        poses = []
+        for k in np.flatnonzero(high[:-1] & high[1:]).tolist():
+            still = np.array_equal(self.positions[k], self.positions[k + 1]) and np.array_equal(*self.tilts[k : k + 2])
+            poses += [self._between(k, s) for s in ([0.0] if still else np.linspace(0.0, 1.0, ALOFT))]
+        return poses
 
     def key_times(self, longest: float, low: float, every: float | None, *, rubs: bool = False) -> Array:
         """Times at which to solve: the ends of all moves, every ``longest`` m of path below the height ``low`` m, and,
@@ -85,9 +109,10 @@ class ProbePath:
         return kept
 
 
-def presses(plan: Sequence[Press], heights: Sequence[float], start: float = 1.0) -> ProbePath:
-    """The moves of a list of presses; ``heights`` (n,) m: the surface's highest point under the probe at each."""
-    top = max(heights) + CLEARANCE
+def presses(plan: Sequence[Press], heights: Sequence[float], start: float = 1.0, top: float | None = None) -> ProbePath:
+    """The moves of a list of presses; ``heights`` (n,) m: the surface's highest point under the probe at each; ``top``
+    m: the height between them, if it is not the usual."""
+    top = max(heights) + CLEARANCE if top is None else top
     t = 0.0
     keys: list[tuple[float, Array, tuple[float, float]]] = []
 

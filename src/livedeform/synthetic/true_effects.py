@@ -244,14 +244,20 @@ def _tether(world: World, values: Mapping[str, Any]) -> World:
 OUTSIDE: dict[str, Apply] = {"anisotropy": _fibres, "tether": _tether, "cavity": _cavity}
 
 
+def known_effect(name: str) -> Apply:
+    """Return what applies the effect of this name; InputError if no truth has it."""
+    function = EFFECTS.get(name) or OUTSIDE.get(name)
+    if function is None:
+        known = ", ".join([*EFFECTS, *OUTSIDE])
+        raise InputError(f"the scenario knows no effect '{name}'", where="truth", remedy=f"use one of {known}")
+    return function
+
+
 def apply_all(world: World, effects: list[Mapping[str, Any]]) -> World:
     """Apply effects {name, values...} of the catalogue or from outside it, in their order."""
     for effect in effects:
         name = effect["name"]
-        function = EFFECTS.get(name) or OUTSIDE.get(name)
-        if function is None:
-            known = ", ".join([*EFFECTS, *OUTSIDE])
-            raise InputError(f"the scenario knows no effect '{name}'", remedy=f"use one of {known}")
+        function = known_effect(name)
         try:
             world = function(world, effect)
         except KeyError as error:

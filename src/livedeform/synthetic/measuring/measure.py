@@ -63,6 +63,12 @@ class Tracker:
         measured, _, _ = self.declared.triangulate(pixels[good], self.seen.noise_px)
         self.T_phantom_left = register(measured, rest[good])
 
+    def rig_at(self, time: float) -> Rig:
+        """Return the true cameras, where they stand at a ``time`` (s after the first recording's start)."""
+        if self.truth.camera_motion is None or time < self.truth.camera_motion[2]:
+            return self.true
+        return self.true.moved(*self.truth.camera_motion[:2])
+
     def frame(
         self,
         stamp_ns: int,
@@ -75,10 +81,7 @@ class Tracker:
         """The markers at a time: ``points`` (n, 3) true places, ``normals`` (n, 3) outward; where the truth
         refracts, at this ``surface``."""
         assert surface is not None or self.truth.index is None, "what refracts has a surface"
-        rig = self.true
-        if self.truth.camera_motion is not None and time >= self.truth.camera_motion[2]:
-            rig = rig.moved(*self.truth.camera_motion[:2])
-        pixels = self._pixels(points, normals, T_probe, rig, surface)
+        pixels = self._pixels(points, normals, T_probe, self.rig_at(time), surface)
         found = np.isfinite(pixels).all(1) & (self.rng.uniform(size=len(points)) >= self.seen.dropout)
         left, covariance, error = self.declared.triangulate(pixels[found], self.seen.noise_px)
         R = self.T_phantom_left[:3, :3]

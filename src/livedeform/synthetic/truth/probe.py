@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 from livedeform.common.types import Array
 from livedeform.synthetic.truth.friction import coulomb
 
+MOST_STEPS, NEARLY = 200, 1e-7  # m
+
 
 @dataclass(frozen=True)
 class TruthProbe:
@@ -34,6 +36,23 @@ class TruthProbe:
         v = p + np.array([0.0, 0.0, half[2]])
         q = np.abs(v) - (half - self.radius)
         return _rounded(q, np.sign(v), self.radius)
+
+    def comes_down_to(self, body: Array, R: Array, at: Array, gap: float = 0.0) -> float:
+        """Return the height z m of its origin at which it first comes within ``gap`` m of the ``body`` (n, 3) m.
+
+        It comes straight down at ``at`` (2,) m, turned by ``R`` (3, 3), by as much as it is clear: it passes nothing.
+        -inf where it passes the body.
+        """
+        z = float(body[:, 2].max()) + gap + 2.0 * sum(self.size)
+        lowest = float(body[:, 2].min()) - gap - 2.0 * sum(self.size)
+        for _ in range(MOST_STEPS):
+            clear = float(self.distance((body - np.array([at[0], at[1], z])) @ R)[0].min()) - gap
+            if clear < NEARLY:
+                return z
+            z -= clear
+            if z < lowest:
+                return -np.inf
+        return z
 
     def _cylinder(self, p: Array) -> tuple[Array, Array, Array]:
         """Find the distance in the half plane (rho, z), and turn it back to space."""

@@ -1,0 +1,1 @@
+"""Check scenarios before anything is made of them."""
