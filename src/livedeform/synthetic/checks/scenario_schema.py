@@ -173,7 +173,7 @@ class HowWarm(Part):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
-        check_curve(self.time, self.value)
+        check_curve(self.time, self.value, self.reference)
         return self
 
 
