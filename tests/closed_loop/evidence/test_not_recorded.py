@@ -122,10 +122,9 @@ def test_blocks_that_have_no_moment_have_no_number(presses: int) -> None:
 def test_recordings_of_one_name_have_what_is_declared_for_it() -> None:
     """The second of two bags called alike was diagnosed with the gravity of all others."""
     asked: list[str] = []
-    acting = SimpleNamespace(timeline=SimpleNamespace(release=0.0))
+    acting = SimpleNamespace(timeline=SimpleNamespace(release=0.0), sigma=lambda _: None)
     experiment = SimpleNamespace(
         of_recording=lambda name: asked.append(name) or acting,
-        sigma=lambda _: None,
         markers=SimpleNamespace(ids=IDS),
         probe=None,
     )
