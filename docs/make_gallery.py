@@ -106,7 +106,7 @@ def wandering(original: Take, size: float = 0.0006) -> Take:
     return replace(original, points=points + size * np.sqrt(time) * ways)
 
 
-def poor(original: Take, sigma: float = 0.0006) -> Take:
+def poor(original: Take, sigma: float = 0.0005) -> Take:
     """A poor tracker, which says so: noise of so many metres in each coordinate."""
     rng = np.random.default_rng(3)
     noise = rng.normal(0.0, sigma, original.points.shape)
