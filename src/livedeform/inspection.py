@@ -6,7 +6,7 @@ import json
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 
@@ -32,10 +32,9 @@ LARGE_OFFSET = 1.0  # s between stamp and receive time
 OFFSET_DRIFT = 0.1  # s by which that offset may change within a recording
 DECODED = (t.STEREO_MARKERS, t.PROBE_POSE, t.PROBE_WRENCH)  # message by message; pictures would take too long
 STREAMS = (t.STEREO_MARKERS, t.STEREO_SURFACE, t.PROBE_POSE, *t.IMAGES, *t.COMPRESSED_IMAGES)
-# what every diagnosis.json has (interfaces, section 5), and what its verdict can be
+# what every diagnosis.json has (interfaces, section 5)
 OF_A_DIAGNOSIS = ("version", "verdict", "effects", "candidates", "error_before", "error_after", "noise_floor",
                   "improvement_interval", "unexplained")  # fmt: skip
-VERDICTS = ("none", "effect", "unexplained", "undecided")
 
 
 @dataclass(frozen=True)
@@ -418,13 +417,15 @@ def _inspect_run(path: Path, experiment: Experiment | None) -> Report:
 
 
 def _inspect_diagnosis(path: Path) -> Report:
-    document = _document(path / "diagnosis.json")
+    from livedeform.closed_loop.assessment.verdict import Verdict  # for a diagnosis only: it takes a moment
+
+    document, verdicts = _document(path / "diagnosis.json"), get_args(Verdict)
     findings = []
     if missing := [key for key in OF_A_DIAGNOSIS if key not in document]:
         text = f"diagnosis.json has no {', '.join(missing)}: it was changed, or another program wrote it"
         findings.append(Finding("ERROR", text, "run livedeform diagnose again"))
-    elif document["verdict"] not in VERDICTS:
-        text = f"the verdict of diagnosis.json is {document['verdict']!r}; known are {', '.join(VERDICTS)}"
+    elif document["verdict"] not in verdicts:
+        text = f"the verdict of diagnosis.json is {document['verdict']!r}; known are {', '.join(verdicts)}"
         findings.append(Finding("ERROR", text, "run livedeform diagnose again"))
     return Report("diagnosis", str(path), _numbers(document), (), tuple(findings))
 

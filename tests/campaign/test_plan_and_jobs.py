@@ -88,6 +88,8 @@ def test_bodies_of_one_name_in_two_folders_are_two(source: Path, tmp_path: Path)
         ("version: 1\nrecordingz: []\n", "unknown key 'recordingz'"),
         ("version: 1\ndiagnose: {max_effects: 99}\n", "diagnose.max_effects"),
         ("version: [\n", "not valid YAML"),
+        ("version: 1\ndiagnose: {}\ndiagnose: {max_effects: 1}\n", ":3: key 'diagnose' is there twice"),
+        ("version: 01\ndiagnose: {max_effects: 010}\n", ":2: 010 begins with a zero"),
     ],
 )
 def test_a_mistake_in_the_file_is_one_line(source: Path, tmp_path: Path, text: str, said: str) -> None:

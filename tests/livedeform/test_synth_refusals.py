@@ -266,6 +266,12 @@ def test_a_key_that_stands_twice_is_refused_with_its_line(tmp_path: Path) -> Non
     assert "s.yaml:4: key 'a' is there twice" in refusal(file)
 
 
+def test_a_number_to_the_base_8_is_refused(tmp_path: Path) -> None:
+    file = tmp_path / "s.yaml"
+    file.write_text("name: x\ndeclared: {youngs_modulus: 04000}\nrecordings: {a: [{at: [0, 0], depth: 0.003}]}\n")
+    assert "s.yaml:2: 04000 begins with a zero, and is read as 2048" in refusal(file)
+
+
 def test_the_command_says_it_in_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """No internal error: a file that is no text, a key that is no text, a probe that is nothing, a seed below zero."""
     plain = (

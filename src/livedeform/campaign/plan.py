@@ -12,7 +12,7 @@ from pydantic import Field, ValidationError
 from livedeform.common.errors import InputError
 from livedeform.common.experiment.schema import Section
 from livedeform.common.experiment.yaml_file import FILE_NAME
-from livedeform.common.yaml_text import parse_yaml, refuse_octal
+from livedeform.common.yaml_text import parse_settings
 from livedeform.outputs import CONFIGURATION
 
 CAMPAIGN_FILE = "campaign.yaml"
@@ -97,8 +97,7 @@ def read_plan(path: Path, out: Path) -> tuple[CampaignFile, list[CampaignRecordi
 
 def _read_file(file: Path) -> CampaignFile:
     try:
-        node, document = parse_yaml(file.read_text(encoding="utf-8"), str(file))
-        refuse_octal(node, str(file))
+        _, document = parse_settings(file.read_text(encoding="utf-8"), str(file))
         return CampaignFile.model_validate(document or {})
     except ValidationError as error:
         first = error.errors()[0]

@@ -299,6 +299,12 @@ def that_may_differ(declared: Sequence[EffectValues]) -> dict[str, EffectValues]
     return {e.name: e for e in declared if count[e.name] == 1 and _numbers_of(all_effects()[e.name], e.values)}
 
 
+def that_stay(declared: Sequence[EffectValues]) -> list[str]:
+    """Name the declared effects of which no other values can be tried."""
+    may_differ = that_may_differ(declared)
+    return [name for name in dict.fromkeys(effect.name for effect in declared) if name not in may_differ]
+
+
 def _numbers_of(info: EffectInfo, values: Mapping[str, Array]) -> tuple[Parameter, ...]:
     """Return the parameters, of the card or of one of its forms, of which each number of an effect's ``values`` is a
     coordinate's; nothing where none are."""

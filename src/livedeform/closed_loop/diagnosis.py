@@ -23,7 +23,7 @@ from livedeform.closed_loop.assessment.held_out import (
 from livedeform.closed_loop.assessment.next_experiment import Proposal
 from livedeform.closed_loop.assessment.ranking import Ranked
 from livedeform.closed_loop.assessment.verdict import Conclusion, Verdict, headline, rivals_of
-from livedeform.closed_loop.candidates import all_effects, doubt, that_may_differ
+from livedeform.closed_loop.candidates import all_effects, doubt, that_stay
 from livedeform.closed_loop.evidence.measuring_noise import Source
 from livedeform.closed_loop.evidence.observation import Observation, are_pressed, are_untouched
 from livedeform.closed_loop.forward import Run
@@ -429,7 +429,7 @@ def stated_doubts(model: FittedModel, most: float) -> list[str]:
 
 def declared_doubts(conclusion: Conclusion, inputs: Inputs) -> list[str]:
     """Name what the experiment declares, of which there may be more than declared, where that cannot be tried."""
-    names = list(dict.fromkeys(e.name for e in inputs.declared if e.name not in that_may_differ(inputs.declared)))
+    names = that_stay(inputs.declared)
     if conclusion.verdict not in ("effect", "unexplained") or not names:
         return []
     return [

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from livedeform.closed_loop.assessment.next_experiment import ProbeReach
-from livedeform.closed_loop.candidates import Candidate, catalogue, check_known, narrowed, that_may_differ
+from livedeform.closed_loop.candidates import Candidate, catalogue, check_known, narrowed, that_stay
 from livedeform.closed_loop.evidence.contacts import contacts_of
 from livedeform.closed_loop.evidence.noise import ModelErrors
 from livedeform.closed_loop.evidence.observation import Observation
@@ -222,10 +222,10 @@ def coarse_enough(mesh: TetMesh, vertices: int, tell: Tell = silent) -> TetMesh:
 def _candidate_names(candidates: Sequence[str] | None, experiment: Experiment) -> list[str] | None:
     """Name the candidates; None: all. Raises ``InputError`` for those that are declared in a way that no other values
     can be tried of."""
-    stay = {e.name for e in experiment.effects} - set(that_may_differ(experiment.effects))
-    if candidates is not None and stay & set(candidates):
+    stay = [name for name in that_stay(experiment.effects) if name in (candidates or ())]
+    if stay:
         raise InputError(
-            f"other values of '{min(stay & set(candidates))}', as the experiment declares it, cannot be tried",
+            f"other values of '{stay[0]}', as the experiment declares it, cannot be tried",
             where="--candidates",
             remedy="leave it out, or undeclare it",
         )

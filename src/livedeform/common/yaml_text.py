@@ -49,6 +49,32 @@ def parse_yaml(text: str, where: str) -> tuple[yaml.Node | None, Any]:
         raise InputError(what, where=where, remedy="correct the value") from error
 
 
+def parse_settings(text: str, where: str) -> tuple[yaml.Node | None, Any]:
+    """Return the same of a file that a user writes. ``InputError`` also for what YAML reads otherwise than it is meant:
+    a key that is there twice, of which the last counts, and a number with leading zeros."""
+    node, document = parse_yaml(text, where)
+    _refuse_doubled_keys(node, where)
+    _refuse_octal(node, where)
+    return node, document
+
+
+def _refuse_doubled_keys(node: yaml.Node | None, where: str) -> None:
+    """Raise ``InputError`` for a key that stands twice in a mapping, and for one that is no plain word."""
+    if isinstance(node, yaml.SequenceNode):
+        for item in node.value:
+            _refuse_doubled_keys(item, where)
+    if isinstance(node, yaml.MappingNode):
+        seen: set[str] = set()
+        for key, value in node.value:
+            line = f"{where}:{key.start_mark.line + 1}"
+            if not isinstance(key, yaml.ScalarNode):
+                raise InputError("a key is no plain word", where=line, remedy="write 'key: value'")
+            if key.value in seen:
+                raise InputError(f"key '{key.value}' is there twice", where=line, remedy="delete one of them")
+            seen.add(key.value)
+            _refuse_doubled_keys(value, where)
+
+
 def _refuse_large(root: yaml.Node, where: str) -> None:
     """Raise ``InputError`` for aliases that lead back to themselves, or that stand for more than can be meant."""
     sizes: dict[int, int] = {}  # by id of the node
@@ -80,7 +106,7 @@ def _refuse_large(root: yaml.Node, where: str) -> None:
     size(root, 0)
 
 
-def refuse_octal(node: yaml.Node | None, where: str) -> None:
+def _refuse_octal(node: yaml.Node | None, where: str) -> None:
     """Raise ``InputError`` for a number with leading zeros, which YAML reads to the base 8: 04000 is 2048."""
     if isinstance(node, yaml.ScalarNode):
         digits = node.value.replace("_", "").lstrip("+-")
@@ -91,7 +117,7 @@ def refuse_octal(node: yaml.Node | None, where: str) -> None:
     elif node is not None:
         for item in node.value:
             for part in item if isinstance(item, tuple) else (item,):
-                refuse_octal(part, where)
+                _refuse_octal(part, where)
 
 
 def _too_deep(where: str) -> InputError:

@@ -83,12 +83,8 @@ def _unit_of(points: Array, surface: Surface) -> str:
     """
     off = {unit: float(np.median(_off(points * METRES_PER_UNIT[unit], surface))) for unit in ("m", "mm")}
     apart = np.ptp(points, axis=0) if len(points) > 1 else points[0]
-    close = float(np.linalg.norm(apart)) * METRES_PER_UNIT["mm"] < CLOSE * _across(surface)
-    return "m" if off["m"] <= REACH * _across(surface) or close or off["m"] < off["mm"] else "mm"
-
-
-def _across(surface: Surface) -> float:
-    return float(np.linalg.norm(surface.upper - surface.lower))
+    close = float(np.linalg.norm(apart)) * METRES_PER_UNIT["mm"] < CLOSE * surface.diagonal
+    return "m" if off["m"] <= REACH * surface.diagonal or close or off["m"] < off["mm"] else "mm"
 
 
 def _off(points: Array, surface: Surface) -> Array:
@@ -134,7 +130,7 @@ def _registered(
         stated = np.array([places.get(label, np.full(3, np.nan)) for label in labels])
         T, misfit = register(stated, points)
         rms = float(np.sqrt(np.nanmean((misfit**2).sum(axis=1))))
-        if rms > INSIDE * _across(surface):
+        if rms > INSIDE * surface.diagonal:
             what = f"the stated places are {1e3 * rms:.2f} mm (rms) from those that the markers have to each other"
             remedy = "measure them again, or look whether labels are exchanged"
             raise InputError(what, where="--place", remedy=remedy)
@@ -146,7 +142,7 @@ def _registered(
 
 def settled(places: RestMarkers, surface: Surface, file: Path) -> Markers:
     """Refuse markers off the body, and call those deep inside internal where no kind is stated."""
-    diagonal = _across(surface)
+    diagonal = surface.diagonal
     distance = surface.distance(places.points)
     inside = surface.contains(places.points)
     kinds = places.kinds or _guessed(places.points, surface, distance, inside)
@@ -161,7 +157,7 @@ def settled(places: RestMarkers, surface: Surface, file: Path) -> Markers:
 
 def _guessed(points: Array, surface: Surface, distance: Array, inside: NDArray[np.bool_]) -> tuple[str, ...]:
     """Kinds by the place: deep inside, beside the body at its lowest height, or on its surface."""
-    diagonal = _across(surface)
+    diagonal = surface.diagonal
     low = points[:, 2] <= surface.lower[2] + BASE * (surface.upper[2] - surface.lower[2])
     deep = inside & (distance > INSIDE * diagonal)
     beside = ~inside & low & (distance > BESIDE * diagonal)

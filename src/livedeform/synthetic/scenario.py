@@ -13,11 +13,12 @@ from typing import Any
 import numpy as np
 
 from livedeform.common.errors import InputError
+from livedeform.common.experiment.schema import as_number
 from livedeform.common.experiment.yaml_file import load_experiment
 from livedeform.common.types import Array
-from livedeform.common.yaml_text import parse_yaml
+from livedeform.common.yaml_text import parse_settings
 from livedeform.synthetic.body_markers import BodyMarkers, aimed_rig, place_markers
-from livedeform.synthetic.checks.scenario_schema import check_scenario, refuse_doubled_keys
+from livedeform.synthetic.checks.scenario_schema import check_scenario
 from livedeform.synthetic.declare import Mesher, write_experiment
 from livedeform.synthetic.measuring.measure import Seen, Tracker
 from livedeform.synthetic.record import START_NS, ScenarioRecording, record
@@ -103,12 +104,11 @@ def _read(scenario: str | Path) -> dict[Any, Any]:
             remedy = f"name a YAML file, or one of {', '.join(shipped())}"
             raise InputError(f"there is no scenario '{scenario}'", remedy=remedy)
     try:
-        node, given = parse_yaml(path.read_text(encoding="utf-8"), str(scenario))
+        _, given = parse_settings(path.read_text(encoding="utf-8"), str(scenario))
     except UnicodeDecodeError as error:
         raise InputError("is no text in UTF-8", where=str(scenario), remedy="save it as plain UTF-8 text") from error
     if not isinstance(given, dict):
         raise InputError("a scenario is a mapping", where=str(scenario), remedy="see the shipped scenarios")
-    refuse_doubled_keys(node, str(scenario))
     return given
 
 
@@ -118,10 +118,7 @@ def _numbers_read(value: Any) -> Any:
         return {key: one if key == "name" else _numbers_read(one) for key, one in value.items()}
     if isinstance(value, list):
         return [_numbers_read(one) for one in value]
-    try:
-        return float(value) if isinstance(value, str) else value
-    except ValueError:
-        return value
+    return as_number(value)
 
 
 def generator(seed: int) -> np.random.Generator:

@@ -102,8 +102,8 @@ class Power:
         n_time = len(np.unique(problem.rows.fold))
         moved = _apart_from_registration(problem, dictionary)
         entries, out = entries_of(candidates), {}
+        views, tried = (parts[:n_time], parts[n_time:]), family or len(candidates)
         for candidate in candidates:
-            views, tried = (parts[:n_time], parts[n_time:]), family or len(candidates)
             found = [
                 max(
                     (self._one(candidate, e, *of, full, views, moved, tried) for of in _of_parameters(candidate, e)),

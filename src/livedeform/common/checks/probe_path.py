@@ -66,7 +66,7 @@ def check_probe(recording: Recording, experiment: Experiment, body: Surface) -> 
     if experiment.probe is None or not recording.poses:
         return []
     path = probe_path(recording.poses, experiment.probe.shape, body, recording.start_ns)
-    diagonal = float(np.linalg.norm(body.upper - body.lower))
+    diagonal = body.diagonal
     nearest, deepest = int(np.argmax(path.depths)), float(path.depths.max())
     if deepest < -FAR * diagonal:
         return [_too_far(recording, experiment, body, deepest, diagonal)]

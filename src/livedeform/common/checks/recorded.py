@@ -154,7 +154,7 @@ def check_places(recording: Recording, experiment: Experiment, body: Surface) ->
     away = away[np.isfinite(away)]
     if not len(away):
         return []
-    limit = FAR_FROM_REFERENCE * float(np.linalg.norm(body.upper - body.lower))
+    limit = FAR_FROM_REFERENCE * body.diagonal
     far = int((away > limit).sum())
     if away[0] <= limit and not far:
         return [Finding("NOTE", f"when first seen, the markers are {1e3 * away[0]:.3f} mm from their places (median)")]

@@ -100,7 +100,7 @@ def _check_markers(experiment: Experiment, surface: Surface) -> None:
     markers = experiment.markers
     if not len(markers.ids):
         return
-    reach = FAR_FRACTION * float(np.linalg.norm(surface.upper - surface.lower))
+    reach = FAR_FRACTION * surface.diagonal
     off = np.linalg.norm(
         np.maximum(surface.lower - markers.points, 0) + np.maximum(markers.points - surface.upper, 0), axis=1
     )
@@ -161,7 +161,7 @@ def _check_lesions(experiment: Experiment, surface: Surface) -> None:
 
 def _check_lengths(experiment: Experiment, surface: Surface) -> None:
     """Refuse lengths that are millimetres by all likelihood: of what lies in the body, and of what presses on it."""
-    across = _across(surface)
+    across = surface.diagonal
     lengths = [(f"phantom.lesions.{i}.diameter", x.diameter) for i, x in enumerate(experiment.lesions)]
     lengths += [("thresholds.error", experiment.thresholds.error)]
     sigmas = experiment.markers.sigmas[np.isfinite(experiment.markers.sigmas)]
@@ -181,7 +181,7 @@ def _check_effect(experiment: Experiment, surface: Surface, i: int, effect: Effe
     where, values = _where(experiment, f"effects.{i}"), effect.values
     if wrong := impossible(effect.name, values, height=float(surface.upper[2] - surface.lower[2])):
         raise InputError(wrong, where=where, remedy="correct the value")
-    for keys, most in ((WITHIN, max(_across(surface), LARGEST_FITTED)), (OUTSIDE, _far(surface))):
+    for keys, most in ((WITHIN, max(surface.diagonal, LARGEST_FITTED)), (OUTSIDE, _far(surface))):
         for key in keys & values.keys():
             size = float(np.linalg.norm(values[key]))
             if size > most:
@@ -189,22 +189,18 @@ def _check_effect(experiment: Experiment, surface: Surface, i: int, effect: Effe
     if effect.name == "inclusion":
         centre, radius = np.reshape(values["centre"], (1, 3)), float(values["radius"])
         away = float(surface.distance(centre)[0]) - radius
-        if away > FAR_FRACTION * _across(surface) and not surface.contains(centre)[0]:
+        if away > FAR_FRACTION * surface.diagonal and not surface.contains(centre)[0]:
             what = f"the effect 'inclusion' lies outside the body, {away:.3g} m from it"
             raise InputError(what, where=where, remedy="give centre and radius in metres, in the surface file's frame")
 
 
-def _across(surface: Surface) -> float:
-    return float(np.linalg.norm(surface.upper - surface.lower))
-
-
 def _far(surface: Surface) -> float:
     """Return the length (m) from which on something beside the body is in millimetres by all likelihood."""
-    return max(TIMES_THE_BODY * _across(surface), LARGEST_BESIDE)
+    return max(TIMES_THE_BODY * surface.diagonal, LARGEST_BESIDE)
 
 
 def _refuse_length(where: str, name: str, length: float, surface: Surface) -> None:
-    what = f"{name} is {length:.4g} m, but the body is {_across(surface):.3g} m across"
+    what = f"{name} is {length:.4g} m, but the body is {surface.diagonal:.3g} m across"
     raise InputError(what, where=where, remedy="lengths are in metres: 2 mm is 0.002")
 
 
@@ -217,7 +213,7 @@ def _check_region(experiment: Experiment, surface: Surface, region: Region, key:
         misses, body = region.above_z > z_max, f"the body's highest point is at z = {z_max:.4g}"
     elif region.box is not None:
         lower, upper = np.array(region.box)
-        slack = NEXT_TO * _across(surface)
+        slack = NEXT_TO * surface.diagonal
         misses = bool((lower > surface.upper).any() or (upper < surface.lower).any())
         body = f"the body lies between {_point(surface.lower)} and {_point(surface.upper)}"
         if not misses and not surface.meets_box(lower - slack, upper + slack):

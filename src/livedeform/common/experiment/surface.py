@@ -35,6 +35,11 @@ class Surface:
         return np.asarray(self.vertices.max(axis=0))
 
     @property
+    def diagonal(self) -> float:
+        """Diagonal of the box around it, m."""
+        return float(np.linalg.norm(self.upper - self.lower))
+
+    @property
     def volume(self) -> float:
         """Enclosed volume in m3, V = sum a . (b x c) / 6 over the triangles (divergence theorem)."""
         a, b, c = np.moveaxis(self.corners, 1, 0)

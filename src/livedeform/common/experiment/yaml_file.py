@@ -13,11 +13,11 @@ from typing import Any
 
 import yaml
 from pydantic import ValidationError
-from pydantic_core import ErrorDetails
 
 from livedeform.common.effect import EFFECT_PARAMETERS, EffectInfo
 from livedeform.common.errors import InputError
 from livedeform.common.experiment.markers_file import no_markers, read_markers
+from livedeform.common.experiment.mistakes import first_mistake, in_words
 from livedeform.common.experiment.plausibility import check_geometry
 from livedeform.common.experiment.schema import (
     Experiment,
@@ -34,7 +34,7 @@ from livedeform.common.experiment.schema import (
 )
 from livedeform.common.experiment.temperature_file import read_temperatures
 from livedeform.common.types import EffectValues
-from livedeform.common.yaml_text import parse_yaml, refuse_octal
+from livedeform.common.yaml_text import parse_settings
 
 __all__ = [
     "Experiment",
@@ -157,8 +157,7 @@ def _relative(document: dict[str, Any], folder: Path) -> dict[str, Any]:
 
 
 def _parse(file: Path) -> tuple[yaml.Node, Any]:
-    """The YAML tree with line numbers, and its value; syntax errors, doubled keys and octal
-    numbers are refused."""
+    """The YAML tree with line numbers, and its value."""
     if not file.is_file():
         raise InputError(
             "the experiment does not exist", where=str(file), remedy=f"name a folder that holds {FILE_NAME}"
@@ -168,28 +167,10 @@ def _parse(file: Path) -> tuple[yaml.Node, Any]:
     except UnicodeDecodeError as error:
         what = f"not valid YAML, {' '.join(str(error).split())}"
         raise InputError(what, where=str(file), remedy="save it as plain UTF-8 text") from error
-    node, document = parse_yaml(text, str(file))
+    node, document = parse_settings(text, str(file))
     if not isinstance(node, yaml.MappingNode) or not isinstance(document, dict):
         raise InputError("is not a mapping of keys", where=str(file), remedy="begin with 'version: 1'")
-    _refuse_doubled_keys(node, file)
-    refuse_octal(node, str(file))
     return node, document
-
-
-def _refuse_doubled_keys(node: yaml.Node, file: Path) -> None:
-    if isinstance(node, yaml.SequenceNode):
-        for item in node.value:
-            _refuse_doubled_keys(item, file)
-    if isinstance(node, yaml.MappingNode):
-        seen: set[str] = set()
-        for key, value in node.value:
-            where = f"{file}:{key.start_mark.line + 1}"
-            if not isinstance(key, yaml.ScalarNode):
-                raise InputError("a key is no plain word", where=where, remedy="write 'key: value'")
-            if key.value in seen:
-                raise InputError(f"key '{key.value}' is there twice", where=where, remedy="delete one of them")
-            seen.add(key.value)
-            _refuse_doubled_keys(value, file)
 
 
 def _explain(error: ValidationError, file: Path, root: yaml.Node) -> InputError:
@@ -197,26 +178,11 @@ def _explain(error: ValidationError, file: Path, root: yaml.Node) -> InputError:
 
     A union reports a mistake once per alternative; the deepest report is about the alternative that was meant.
     """
-    details = max(error.errors(), key=lambda d: len(d["loc"])) if _same_place(error) else _first(error)
+    details = max(error.errors(), key=lambda d: len(d["loc"])) if _same_place(error) else first_mistake(error)
     keys, line = _locate(root, details["loc"])
-    context = details.get("ctx", {})
-    if details["type"] == "livedeform":
-        what, remedy = context["what"], context["remedy"]
-    elif details["type"] == "missing":
-        what, remedy = f"key '{details['loc'][-1]}' is missing", "add it; docs/experiment.md describes every key"
-    else:
-        message = details["msg"][:1].lower() + details["msg"][1:]
-        shown = repr(details["input"])
-        what = f"{message}, but it is {shown if len(shown) < 60 else shown[:57] + '...'}"
-        remedy = "correct the value"
+    what, remedy = in_words(details, "add it; docs/experiment.md describes every key")
     where = f"{file}:{line}: {keys}" if keys else f"{file}:{line}"
     return InputError(what, where=where, remedy=remedy)
-
-
-def _first(error: ValidationError) -> ErrorDetails:
-    """The first mistake; before what is missing, a key that nobody knows: it may be the missing one, mistyped."""
-    unknown = (d for d in error.errors() if str(d.get("ctx", {}).get("what", "")).startswith("unknown key"))
-    return next(unknown, error.errors()[0])
 
 
 def _same_place(error: ValidationError) -> bool:

@@ -10,10 +10,10 @@ from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
-import yaml
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 
 from livedeform.common.errors import InputError
+from livedeform.common.experiment.mistakes import first_mistake, in_words
 from livedeform.common.experiment.schema import (
     Length,
     Material,
@@ -273,21 +273,6 @@ def check_scenario(spec: Mapping[str, Any], source: str) -> None:
     _validated(Probe, {"shape": probe["shape"], "contact": {"friction": probe["friction"]}}, source, "probe")
 
 
-def refuse_doubled_keys(node: yaml.Node | None, source: str) -> None:
-    """Raise ``InputError`` for a key that stands twice in a mapping of a YAML tree, of which only the last counts."""
-    if isinstance(node, yaml.SequenceNode):
-        for item in node.value:
-            refuse_doubled_keys(item, source)
-    if isinstance(node, yaml.MappingNode):
-        seen: set[Any] = set()
-        for key, value in node.value:
-            if isinstance(key, yaml.ScalarNode) and key.value in seen:
-                where = f"{source}:{key.start_mark.line + 1}"
-                raise InputError(f"key '{key.value}' is there twice", where=where, remedy="delete one of them")
-            seen.add(key.value if isinstance(key, yaml.ScalarNode) else id(key))
-            refuse_doubled_keys(value, source)
-
-
 def _validated(model: type[BaseModel], values: Mapping[str, Any], source: str, under: str) -> None:
     try:
         model.model_validate(values)
@@ -296,21 +281,11 @@ def _validated(model: type[BaseModel], values: Mapping[str, Any], source: str, u
 
 
 def _explained(error: ValidationError, values: Mapping[str, Any], source: str, under: str) -> InputError:
-    """Return the first mistake as one line; before what is missing, a key that nobody knows: it may be that one,
-    mistyped."""
-    reports = error.errors()
-    unknown = (r for r in reports if str(r.get("ctx", {}).get("what", "")).startswith("unknown key"))
-    first = next(unknown, reports[0])
-    keys, context = _place(values, first["loc"]), first.get("ctx", {})
-    where = f"{source}: {'.'.join([*([under] if under else []), *keys])}".removesuffix(": ")
-    if first["type"] == "livedeform":
-        return InputError(context["what"], where=where, remedy=context["remedy"])
-    if first["type"] == "missing":
-        return InputError(f"key '{first['loc'][-1]}' is missing", where=where, remedy="add it")
-    message, remedy = IN_WORDS.get(first["type"], (first["msg"][:1].lower() + first["msg"][1:], "correct the value"))
-    shown = repr(first["input"])
-    what = f"{message}, but it is {shown if len(shown) < 60 else shown[:57] + '...'}"
-    return InputError(what, where=where, remedy=remedy)
+    """Return the first mistake as one line."""
+    first = first_mistake(error)
+    keys = [*([under] if under else []), *_place(values, first["loc"])]
+    what, remedy = in_words(first, "add it", IN_WORDS)
+    return InputError(what, where=f"{source}: {'.'.join(keys)}".removesuffix(": "), remedy=remedy)
 
 
 def _place(values: Any, loc: Sequence[int | str]) -> list[str]:
