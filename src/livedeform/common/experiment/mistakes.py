@@ -1,4 +1,4 @@
-"""The first mistake that pydantic found in what a user wrote, in words."""
+"""Say the first mistake that pydantic found in what a user wrote, in words."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ MOST_SHOWN = 60  # characters of a wrong value
 
 
 def first_mistake(error: ValidationError) -> ErrorDetails:
-    """The first mistake; before what is missing, a key that nobody knows: it may be the missing one, mistyped."""
+    """Return the first mistake; before what is missing, a key that nobody knows: it may be the missing one, mistyped."""
     reports = error.errors()
     unknown = (r for r in reports if str(r.get("ctx", {}).get("what", "")).startswith("unknown key"))
     return next(unknown, reports[0])
@@ -20,7 +20,7 @@ def first_mistake(error: ValidationError) -> ErrorDetails:
 def in_words(
     mistake: ErrorDetails, of_missing: str, others: Mapping[str, tuple[str, str]] | None = None
 ) -> tuple[str, str]:
-    """What is wrong and the remedy; ``of_missing``: that for a missing key. ``others`` says what pydantic's own types
+    """Return what is wrong and the remedy; ``of_missing``: that for a missing key. ``others`` says what pydantic's own types
     of mistakes are called and what helps."""
     context = mistake.get("ctx", {})
     if mistake["type"] == "livedeform":

@@ -36,7 +36,7 @@ class Surface:
 
     @property
     def diagonal(self) -> float:
-        """Diagonal of the box around it, m."""
+        """Return the diagonal of the box around it, m."""
         return float(np.linalg.norm(self.upper - self.lower))
 
     @property
