@@ -11,7 +11,7 @@ MOST_SHOWN = 60  # characters of a wrong value
 
 
 def first_mistake(error: ValidationError) -> ErrorDetails:
-    """Return the first mistake; before what is missing, a key that nobody knows: it may be the missing one, mistyped."""
+    """Return the first mistake; before what is missing, a key that nobody knows: it may be that one, mistyped."""
     reports = error.errors()
     unknown = (r for r in reports if str(r.get("ctx", {}).get("what", "")).startswith("unknown key"))
     return next(unknown, reports[0])
@@ -20,8 +20,8 @@ def first_mistake(error: ValidationError) -> ErrorDetails:
 def in_words(
     mistake: ErrorDetails, of_missing: str, others: Mapping[str, tuple[str, str]] | None = None
 ) -> tuple[str, str]:
-    """Return what is wrong and the remedy; ``of_missing``: that for a missing key. ``others`` says what pydantic's own types
-    of mistakes are called and what helps."""
+    """Return what is wrong and the remedy; ``of_missing``: that for a missing key. ``others`` says what pydantic's own
+    types of mistakes are called and what helps."""
     context = mistake.get("ctx", {})
     if mistake["type"] == "livedeform":
         return context["what"], context["remedy"]
