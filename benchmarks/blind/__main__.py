@@ -1,7 +1,7 @@
 """The blind test from the command line.
 
-    python -m benchmarks.blind run --out DIR [--set small|medium|large|dome|foreign|random] [--truth own|felupe]
-        [--jobs N] [--limit N] [--only PART] [--half even|odd] [--sizes]
+    python -m benchmarks.blind run --out DIR [--set small|medium|large|dome|foreign|random|redeclared]
+        [--truth own|felupe] [--jobs N] [--limit N] [--only PART] [--half even|odd] [--sizes]
     python -m benchmarks.blind table --out DIR [--set ...]
 
 ``run`` goes on where it was stopped; ``table`` prints what is there. ``--sizes`` also measures how large the effects
@@ -19,10 +19,11 @@ from pathlib import Path
 from benchmarks.blind.cases import SETS as OWN_SETS
 from benchmarks.blind.foreign_cases import foreign
 from benchmarks.blind.random_cases import randomised
+from benchmarks.blind.redeclared_cases import redeclared
 from benchmarks.blind.run import TRUTHS, run_all
 from benchmarks.blind.table import score, table
 
-SETS = {**OWN_SETS, "foreign": foreign, "random": randomised}
+SETS = {**OWN_SETS, "foreign": foreign, "random": randomised, "redeclared": redeclared}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -11,6 +11,7 @@ import pytest
 from benchmarks.blind import cases as blind_cases
 from benchmarks.blind.detection import curve, predicted, times_visible
 from benchmarks.blind.random_cases import MODULUS, NOISE, conditions, drawn_effect, randomised
+from benchmarks.blind.redeclared_cases import redeclared
 from benchmarks.blind.sizes import moved_between
 from benchmarks.blind.table import compare, score, table
 from scipy.stats import norm
@@ -132,6 +133,15 @@ def test_an_inclusion_is_drawn_in_a_block_where_the_elements_of_the_truth_end_at
     within = [case.scenario()["body"] for case in randomised() if "inclusion" in case.truth]
     assert len(within) > 10
     assert all(body["shape"] == "block" and "ball" in body for body in within)
+
+
+def test_what_is_redeclared_is_right_or_half_of_what_is() -> None:
+    cases = redeclared()
+    assert {n for c in cases for n in c.truth if c.kind == "single"} == set(blind_cases.VISIBLE)
+    for case in cases:
+        spec = scenario.load(case.scenario())
+        (listed,) = spec["declared"]["effects"]
+        assert listed["name"] == case.truth[0] and (case.kind == "none") == (listed == case.effects[0])
 
 
 def test_an_angle_is_the_same_after_a_turn_and_has_no_size_to_be_wrong_by():

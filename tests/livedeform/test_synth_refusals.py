@@ -39,6 +39,7 @@ WHOLE: dict[str, Any] = {  # every section is there, with every kind of value
         "element_size": 0.012,
         "ship_mesh": False,
         "sigmas": {"youngs_modulus": 200.0, "density": 5.0},
+        "effects": [{"name": "viscoelasticity", "g": [0.2], "tau": [1.0]}, {"name": "base_slip", "stiffness": 3e5}],
     },
     "probe": {"shape": {"box": [0.02, 0.01, 0.04]}, "edge_radius": 0.002, "friction": 0.1},
     "markers": {"surface": 12, "internal": 2, "support": 4},
@@ -305,5 +306,7 @@ def test_there_are_as_many_markers_as_are_asked_for(kind: str, n: int) -> None:
 def test_what_is_made_loads_as_an_experiment(tmp_path: Path) -> None:
     spec = {**WHOLE, "recordings": {"b c": WHOLE["recordings"]["b c"]}, "truth": []}
     folder = scenario.make(spec, tmp_path)
-    assert load_experiment(folder).name == "whole"
+    experiment = load_experiment(folder)
+    assert experiment.name == "whole"
+    assert [effect.name for effect in experiment.effects] == ["viscoelasticity", "base_slip"]
     assert np.load(tmp_path / "truth" / "b c.npz")["force"][0].tolist() == [0.0, 0.0, 0.0]

@@ -61,7 +61,7 @@ def write_experiment(
     if spec["temperature"] is not None:  # whoever measures it knows it
         document["timeline"] = {"clock_start_ns": START_NS}
         document["temperature"] = {key: spec["temperature"][key] for key in ("time", "value", "reference")}
-    document["effects"] = []
+    document["effects"] = list(declared["effects"])
     document["thresholds"] = {"error": float(spec["threshold"])}
     writing.write_yaml(folder / "experiment.yaml", document)
 

@@ -52,6 +52,7 @@ DEFAULTS: dict[str, Any] = {
         "element_size": 0.010,
         "ship_mesh": True,
         "sigmas": {},
+        "effects": [],  # as an experiment lists them, right or not
     },
     "probe": {"shape": {"box": [0.03, 0.015, 0.04]}, "edge_radius": 0.002, "friction": 0.0},
     "markers": {"surface": 32, "internal": 0, "support": 4},

@@ -744,6 +744,7 @@ Effect = Annotated[
     PlainSerializer(_write_effect),
     WithJsonSchema({"type": "object", "required": ["name"], "properties": {"name": {"enum": list(EFFECT_PARAMETERS)}}}),
 ]
+Effects = Annotated[tuple[Effect, ...], AfterValidator(_each_once)]
 
 
 # --- the whole -------------------------------------------------------------------------------------------------------
@@ -786,7 +787,7 @@ class Experiment(Section):
     name is its file's, with or without .mcap, or its folder's; of several that fit, the later line decides."""
     temperature: Temperature | None = None
     """How warm the body is over time; needed for thermal_expansion."""
-    effects: Annotated[tuple[Effect, ...], AfterValidator(_each_once)] = ()
+    effects: Effects = ()
     """What the model has beyond all this, as [{name: viscoelasticity, g: [0.3], tau: [2.0]}]; docs/effects.md lists
     them."""
     thresholds: Thresholds = Thresholds()

@@ -15,6 +15,7 @@ from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Fie
 from livedeform.common.errors import InputError
 from livedeform.common.experiment.mistakes import first_mistake, in_words
 from livedeform.common.experiment.schema import (
+    Effects,
     Length,
     Material,
     NonNegative,
@@ -81,7 +82,7 @@ RecordingName = Annotated[str, AfterValidator(_plain_name)]
 class Part(BaseModel):
     """Base of every mapping in a scenario: unknown keys are refused."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, arbitrary_types_allowed=True)  # arrays of effects
 
     @model_validator(mode="before")
     @classmethod
@@ -137,6 +138,7 @@ class Declared(Part):
     element_size: Length
     ship_mesh: Annotated[bool, Field(strict=True)]
     sigmas: Sigmas
+    effects: Effects
 
 
 class OneProbe(Part):

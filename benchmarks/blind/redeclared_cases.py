@@ -1,0 +1,70 @@
+"""Experiments that declare an effect, as one does that a diagnosis has mended: rightly, or by another value.
+
+Conditions are drawn as in `benchmarks.blind.random_cases`, by seeds of their own. Of five cases of a half two declare
+what is true, in which nothing is the matter; three declare the effect half as far from nothing as it is, so that what
+is missing is about twice the tracker's noise, of every third of these once.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from benchmarks.blind.cases import NEUTRAL, VISIBLE, Case
+from benchmarks.blind.random_cases import N_NONE, N_OF, RandomCase, conditions, drawn_effect
+
+FIRST_SEED = 1000
+IN_PROPORTION = ("inclusion", "skin")  # their ratios are no more than half there by their square roots
+
+
+@dataclass(frozen=True)
+class RedeclaredCase(RandomCase):
+    """One drawn experiment that lists its effects, as they are (``kind`` none) or half of them."""
+
+    def scenario(self) -> dict[str, Any]:
+        """Return the scenario of the case."""
+        spec = super().scenario()
+        listed = self.effects if self.kind == "none" else [halved(effect) for effect in self.effects]
+        spec["declared"]["effects"] = [dict(effect) for effect in listed]
+        return spec
+
+
+def halved(effect: Mapping[str, Any]) -> dict[str, Any]:
+    """Return an effect that is half as far from nothing; where it acts, and from when, stays."""
+    less, name = copy.deepcopy(dict(effect)), effect["name"]
+    if name == "base_slip":
+        less["stiffness"] *= 2.0
+    elif name in IN_PROPORTION:
+        less["ratio"] **= 0.5
+    elif name == "camera_motion":
+        less |= {key: [v / 2.0 for v in less[key]] for key in ("translation", "rotation")}
+    elif name == "gravity_tilt":
+        less |= {key: less[key] / 2.0 for key in ("angle_x", "angle_y")}
+    else:
+        key = next(iter(VISIBLE[name]))
+        nothing = NEUTRAL.get(key, 0.0)
+        half = (nothing + np.asarray(less[key], float)) / 2.0
+        less[key] = half.tolist()
+    return less
+
+
+def redeclared(n: int = 60) -> list[Case]:
+    """Return ``n`` cases of each half, the halves in turn: even seeds to look at, odd ones to prove."""
+    return [case for pair in zip(_half(0, n), _half(1, n), strict=True) for case in pair]
+
+
+def _half(parity: int, n: int) -> Iterator[RedeclaredCase]:
+    """Return the cases of one half in their order."""
+    names = np.random.default_rng([10, parity]).permutation(list(VISIBLE))
+    wrong = 0
+    for k in range(n):
+        seed, name = FIRST_SEED + parity + 2 * k, str(names[k % len(names)])
+        right = k * N_NONE % N_OF < N_NONE
+        size = 0.0 if right else 1.0 if wrong % 3 == 2 else 2.0
+        wrong += not right
+        drawn = drawn_effect(name, 2.0 * (size or 2.0), conditions(seed, [name]), np.random.default_rng([8, seed]))
+        yield RedeclaredCase(f"redeclared-{seed}", "none" if right else "single", (drawn,), size, seed)
