@@ -13,6 +13,7 @@ from livedeform.common.frames import (
     fit_rigid,
     fit_rigid_by_noise,
     inverse,
+    make_a_frame,
     pose_matrix,
     slerp,
     transform,
@@ -118,3 +119,11 @@ def test_places_that_are_said_to_be_known_exactly_are_fitted_like_others():
     target = points + rng.normal(scale=1e-4, size=(9, 3))
     plain = fit_rigid(points, target)
     np.testing.assert_allclose(fit_misplaced(points, np.zeros((9, 3, 3)), target, plain), plain, atol=1e-8)
+
+
+@pytest.mark.parametrize("n", [0, 1, 2, 3, 12])
+def test_points_on_a_line_or_at_one_place_leave_a_turn_open(n: int) -> None:
+    line = np.outer(np.linspace(-0.05, 0.05, n), [1.0, 2.0, -1.0]) + [0.1, 0.2, 0.3]
+    assert not make_a_frame(line)
+    assert not make_a_frame(np.tile([0.1, 0.2, 0.3], (n, 1)))
+    assert make_a_frame(np.concatenate([line, [[0.1, 0.2, 0.32]]])) == (n > 1)

@@ -17,7 +17,7 @@ from livedeform.stereo_node.calibrate.calibrate import calibrate
 from livedeform.stereo_node.detect.settings import DetectorSettings
 from livedeform.stereo_node.discs.outlines import area_centre
 from livedeform.stereo_node.pipeline import StereoTracker, TrackerSettings
-from livedeform.stereo_node.track.register import RegistrationError, register_either_way
+from livedeform.stereo_node.track.register import RegistrationError, register_either_way, register_named
 
 SQUARE, PX = 0.015, 40  # m, fine pixels
 RIG = make_test_rig(960, 720, 800.0, 0.1)
@@ -177,3 +177,12 @@ def test_a_board_on_a_body_that_is_not_symmetric_is_registered():
         RegistrationError, match="looks alike from two sides, and fits its places both ways; use a chec"
     ):
         register_either_way(points, noise, board.points, board.turns, 2e-2)
+
+
+@pytest.mark.parametrize("seen_rows", [np.arange(3), np.arange(7), np.array([0, 8, 16])])
+def test_corners_on_a_line_leave_open_how_the_cameras_are_turned(seen_rows):
+    places = Board("checkerboard", 7, 5, SQUARE).points  # a line of corners of a board that is half covered
+    T = transform(Rotation.from_rotvec([0.4, -0.2, 0.9]).as_matrix(), np.array([0.05, 0.0, 0.45]))
+    points, noise = apply(T, places[seen_rows]), np.tile(np.eye(3) * 1e-10, (len(seen_rows), 1, 1))
+    with pytest.raises(RegistrationError, match=f"the {len(points)} coded markers .* lie on a line"):
+        register_named(points, noise, places[seen_rows], seen_rows, seen_rows, 2e-3)

@@ -19,6 +19,7 @@ __all__ = [
     "fit_rigid_by_noise",
     "increment_jacobian",
     "inverse",
+    "make_a_frame",
     "matrix_pose",
     "pose_matrix",
     "slerp",
@@ -27,6 +28,7 @@ __all__ = [
 ]
 
 MAKE_A_FRAME = 3  # points, if they are not in one line
+ON_A_LINE = 0.02  # of the spread along a line, beside it: a turn about it is as uncertain as 50 misfits
 LEAST_NOISE = 1e-7  # m: a tracker may say that it knows a place exactly
 NO_ROTATION = "a pose is not finite or has the quaternion zero"
 
@@ -80,6 +82,14 @@ def inverse(T: Array) -> Array:
     """Return T_source_target of T_target_source."""
     R = T[:3, :3].T
     return transform(R, -R @ T[:3, 3])
+
+
+def make_a_frame(points: Array) -> bool:
+    """Tell whether ``points`` (n, 3) leave no turn open: three or more, and not on a line."""
+    if len(points) < MAKE_A_FRAME:
+        return False
+    spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
+    return bool(spread[1] > ON_A_LINE * spread[0])
 
 
 def fit_rigid(source: Array, target: Array, weights: Array | None = None) -> Array:

@@ -15,7 +15,7 @@ from livedeform.common.bags.recording_writer import RecordingWriter
 from livedeform.common.bags.types import one_line
 from livedeform.common.bags.write import BagWriter
 from livedeform.common.errors import InputError, RecordingError
-from livedeform.common.frames import apply, fit_rigid, inverse
+from livedeform.common.frames import apply, fit_rigid, inverse, make_a_frame
 from livedeform.common.processes import worker_pool
 from livedeform.common.types import Array, Ids, MarkerFrame
 
@@ -25,7 +25,6 @@ STILL_SECONDS = 0.2
 PARSE_SECONDS = 60.0
 MEMORY = 1 << 30  # bytes, besides twenty times the file
 HIGHEST_RATE = 1e6  # Hz
-ON_A_LINE = 0.02  # of the markers' spread along a line, beside it: a turn about it is as uncertain as 50 misfits
 OTHER_PLACES = 0.25  # of the markers' spread (rms): a misfit beyond that is of other markers, or of another unit
 MIRRORED = 0.5  # of the misfit: a mirror image that fits better than that is what the take shows
 DIGITS = sorted((c * u * 10.0**-k for k in range(2, 6) for c in (1.0, 0.5, 0.2) for u in (1.0, 0.254)), reverse=True)
@@ -267,8 +266,7 @@ def register(reference: Array, rest: Array) -> tuple[Array, Array]:
             f"only {known.sum()} markers have a place in the experiment and in the take",
             remedy="name at least three with --ids LABEL=ID",
         )
-    spread = np.linalg.svd(reference[known] - reference[known].mean(axis=0), compute_uv=False)
-    if spread[1] < ON_A_LINE * spread[0]:
+    if not make_a_frame(reference[known]):
         raise InputError(
             "the markers with a place in the experiment lie on a line, and a turn about it cannot be told",
             remedy="give one more marker beside it a place",
@@ -281,7 +279,7 @@ def register(reference: Array, rest: Array) -> tuple[Array, Array]:
             f"{1e3 * mirrored:.2f} mm)",
             remedy="negate one axis of all its points (or check which marker is which: --ids NAME=ID)",
         )
-    size = float(np.linalg.norm(spread) / np.sqrt(known.sum()))
+    size = _rms(reference[known] - reference[known].mean(axis=0))
     if rms > OTHER_PLACES * size:
         raise InputError(
             f"{known.sum()} markers do not lie as the experiment's do: misfit {1e3 * rms:.1f} mm rms, spread "

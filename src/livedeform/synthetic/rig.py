@@ -7,10 +7,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from livedeform.common.errors import InputError
-from livedeform.common.frames import MAKE_A_FRAME, fit_rigid, inverse
+from livedeform.common.frames import fit_rigid, inverse, make_a_frame
 from livedeform.common.types import Array
 
-ON_A_LINE = 0.02  # of the markers' spread along a line, beside it: of a turn about it they say next to nothing
 
 
 @dataclass(frozen=True)
@@ -131,13 +130,9 @@ def stereo_rig(
 
 def register(points_left: Array, points_phantom: Array) -> Array:
     """T_phantom_left from the markers (n, 3) m at rest; InputError where they leave a turn open."""
-    n = len(points_phantom)
-    spread = np.zeros(3)
-    if n >= MAKE_A_FRAME:
-        spread = np.linalg.svd(points_phantom - points_phantom.mean(axis=0), compute_uv=False)
-    if spread[1] <= ON_A_LINE * spread[0]:
+    if not make_a_frame(points_phantom):
         raise InputError(
-            f"the {n} markers on surface and support that both cameras see leave open how the cameras are turned",
+            f"the {len(points_phantom)} markers on surface and support that both cameras see leave open how the cameras are turned",
             where="markers",
             remedy="ask for more of them, so that three are seen that are on no line",
         )

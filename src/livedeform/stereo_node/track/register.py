@@ -25,6 +25,7 @@ from livedeform.common.frames import (
     fit_rigid_by_noise,
     increment_jacobian,
     inverse,
+    make_a_frame,
 )
 from livedeform.common.types import Array
 from livedeform.stereo_node.track.match import assign
@@ -134,6 +135,12 @@ def register_named(
             f"{len(points)} coded markers with known places are too few",
             where="stereo.pose",
             remedy="show at least 3, or give the pose",
+        )
+    if not make_a_frame(markers):
+        raise RegistrationError(
+            f"the {len(points)} coded markers with known places lie on a line, and leave open how the cameras are turned",
+            where="stereo.pose",
+            remedy="show one more beside the line, or give the pose",
         )
     T = fit_rigid_by_noise(points, covariances, markers, fit_rigid(points, markers), tolerance / 6)
     residual = markers - apply(T, points)
