@@ -123,7 +123,7 @@ def test_places_that_are_said_to_be_known_exactly_are_fitted_like_others():
 
 @pytest.mark.parametrize("n", [0, 1, 2, 3, 12])
 def test_points_on_a_line_or_at_one_place_leave_a_turn_open(n: int) -> None:
-    line = np.outer(np.linspace(-0.05, 0.05, n), [1.0, 2.0, -1.0]) + [0.1, 0.2, 0.3]
+    line = np.array([0.1, 0.2, 0.3]) + np.outer(np.linspace(-0.05, 0.05, n), [1.0, 2.0, -1.0])
     assert not make_a_frame(line)
     assert not make_a_frame(np.tile([0.1, 0.2, 0.3], (n, 1)))
     assert make_a_frame(np.concatenate([line, [[0.1, 0.2, 0.32]]])) == (n > 1)

@@ -138,7 +138,7 @@ def register_named(
         )
     if not make_a_frame(markers):
         raise RegistrationError(
-            f"the {len(points)} coded markers with known places lie on a line, and leave open how the cameras are turned",
+            f"the {len(points)} coded markers with known places lie on a line: how the cameras are turned stays open",
             where="stereo.pose",
             remedy="show one more beside the line, or give the pose",
         )
