@@ -131,8 +131,8 @@ def register(points_left: Array, points_phantom: Array) -> Array:
     """T_phantom_left from the markers (n, 3) m at rest; InputError where they leave a turn open."""
     if not make_a_frame(points_phantom):
         raise InputError(
-            f"the {len(points_phantom)} markers on surface and support that both cameras see leave open how these "
-            "are turned",
+            f"the {len(points_phantom)} markers on surface and support that both cameras see leave open "
+            "how the cameras are turned",
             where="markers",
             remedy="ask for more of them, so that three are seen that are on no line",
         )
