@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -14,13 +15,15 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "closed_loop"))
 import toy
 import toy_loop as loop
 
-from livedeform.closed_loop.diagnosis import Diagnosis
+from livedeform import outputs
+from livedeform.closed_loop.diagnosis import Diagnosis, Replay
 from livedeform.closed_loop.write import as_json
 from livedeform.fem_node.mesh.structured import hemi_ellipsoid_mesh
 from livedeform.report.diagnosis import collect
 from livedeform.report.diagnosis import page as diagnosis_page
 from livedeform.report.diagnosis.evidence import RestingBody
 from livedeform.report.run.evidence import SurfaceMesh
+from livedeform.report.text import less_between
 
 
 @pytest.fixture(scope="module")
@@ -48,6 +51,32 @@ def test_the_page_of_an_answer(result: Diagnosis, tmp_path: Path, monkeypatch: p
     assert "key moments of" in text and "added viscoelasticity" in text
 
 
+def test_the_page_names_files_as_they_will_be_called(
+    result: Diagnosis, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(collect, "body_at_rest", body)
+    replayed = replace(result, replays=(Replay(Path("b.mcap")),))
+    with outputs.prepared(tmp_path / "why", ["report.html"], force=False) as draft:
+        diagnosis_page.write_report(draft, replayed, SimpleNamespace(name="toy"))  # type: ignore[arg-type]
+    page = (tmp_path / "why" / "report.html").read_text()
+    assert f"livedeform run {tmp_path}/why/experiment.fitted.yaml --bag b.mcap --out {tmp_path}/why/run" in page
+    assert draft.name not in page
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "said"),
+    [
+        (0.79, 0.831, "79 to 83 % less"),
+        (-0.0048, 0.0323, "0.5 % more to 3.2 % less"),
+        (-0.31, -0.0801, "31 to 8.0 % more"),
+        (0.0, 0.0, "0.0 to 0.0 % less"),
+        (-np.inf, 0.2, "– to 20 % less"),
+    ],
+)
+def test_a_change_of_an_error_says_which_way_it_goes(low: float, high: float, said: str) -> None:
+    assert less_between(low, high) == said
+
+
 def test_residuals_are_the_held_out_single_frames(result: Diagnosis) -> None:
     evidence_before = collect.residuals(result.errors_before.recordings[0])
     errors = np.concatenate([r.distances for r in evidence_before])
@@ -61,3 +90,12 @@ def test_fit_rows_carry_value_and_sigma_of_the_answer(result: Diagnosis) -> None
     for key, value in effect.values.items():
         row = rows[f"viscoelasticity.{key}[0]"]
         assert (row.value, row.sigma) == pytest.approx((value[0], effect.sigmas[key][0]))
+
+
+def test_a_step_without_a_screening_of_its_own_tells_no_chance(result: Diagnosis) -> None:
+    last = result.selection.steps[-1]
+    taken = replace(last, added="", reason="skin explains nothing: taken out")
+    steps = (*result.selection.steps, taken)
+    said = dict(collect.facts(replace(result, selection=replace(result.selection, steps=steps))))
+    assert said[f"step {len(steps)}"] == "skin explains nothing: taken out"
+    assert "; chance alone: p = " in said[f"step {len(steps) - 1}"]

@@ -314,7 +314,8 @@ def held_out_notes(model: FittedModel, taken: float, called: Called) -> list[str
         return []
     names = ", ".join(model.names)
     tells = called.sigma < 1.0  # all of it from nothing
-    return [f"on held-out data {names} take {taken:.1f} off chi2", *([_amount(names, called)] if tells else [])]
+    take = "takes" if len(model.names) == 1 else "take"
+    return [f"on held-out data {names} {take} {taken:.1f} off chi2", *([_amount(names, called)] if tells else [])]
 
 
 def _amount(names: str, called: Called) -> str:

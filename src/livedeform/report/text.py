@@ -30,6 +30,21 @@ def interval(statistic: Statistic) -> str:
     return f"95 % interval, this recording: {mm(statistic.low)} to {mm(statistic.high)}"
 
 
+def less(share: float) -> str:
+    """Return by how much an error has become less, or more, as text; a dash where that is not known."""
+    if not np.isfinite(share):
+        return "–"
+    percent = f"{100.0 * abs(share):.{0 if abs(share) >= 0.0995 else 1}f} %"
+    return f"{percent} {'more' if share < 0.0 else 'less'}"
+
+
+def less_between(low: float, high: float) -> str:
+    """Return from what to what an error has become less, as text."""
+    ends = [less(low), less(high)]
+    same = ends[0].split()[1:] == ends[1].split()[1:]
+    return f"{ends[0].split()[0] if same else ends[0]} to {ends[1]}"
+
+
 def words(name: str) -> str:
     """An effect's name as it reads in a sentence."""
     return name.replace("_", " ")

@@ -15,11 +15,13 @@ from livedeform.closed_loop.diagnosis import Diagnosis
 from livedeform.closed_loop.evidence.measuring_noise import median
 from livedeform.closed_loop.evidence.observation import Observation
 from livedeform.closed_loop.inference.fitted_model import Added
+from livedeform.closed_loop.inference.forward_selection import SelectionStep
 from livedeform.common.effect import Parameter
 from livedeform.common.experiment.yaml_file import Experiment
 from livedeform.common.types import Array
 from livedeform.compare_node.residual import Residual
 from livedeform.fem_node.model import PhantomModel
+from livedeform.outputs import final
 from livedeform.report.diagnosis.evidence import Compared, DiagnosisEvidence, FitRow, NoiseRow, RestingBody
 from livedeform.report.run.evidence import SurfaceMesh
 from livedeform.report.text import words
@@ -47,8 +49,9 @@ def evidence_of(result: Diagnosis, experiment: Experiment, out: Path) -> Diagnos
 
 
 def commands(result: Diagnosis, out: Path) -> list[str]:
-    """Return how the graph runs the fitted model on what was held out, a command line each."""
-    lines = []
+    """Return how the graph runs the fitted model on what was held out, a command line each, by the names that what is
+    in a draft ``out`` will have."""
+    lines, out = [], final(out)
     for replay in result.replays:
         after = ["--after", *map(str, replay.after)] if replay.after else []
         words = [str(out / "experiment.fitted.yaml"), "--bag", str(replay.bag), *after, "--out", str(out / "run")]
@@ -153,10 +156,7 @@ def coordinate_name(added: Added, c: Coordinate) -> str:
 def facts(result: Diagnosis) -> list[tuple[str, str]]:
     """Return what was fitted, held out and counted, step by step, and how long it took."""
     rows = [("fitted", _described(result.selection.observations)), ("held out", _described(result.held_out))]
-    for number, step in enumerate(result.selection.steps, 1):
-        what = f"added {words(step.added)}" if step.added else "nothing added"
-        p = f"chance alone: p = {step.screening.family_p:.2g} over {len(step.screening.scores)} candidates"
-        rows.append((f"step {number}", f"{what}: {step.reason}; {p}"))
+    rows += [(f"step {number}", said) for number, said in enumerate(_steps(result.selection.steps), 1)]
     if np.isfinite(result.explained):
         rows.append(("explained", f"{share_of_evidence(result.explained)} % of {EVIDENCE}"))
     rows.append(
@@ -169,6 +169,18 @@ def facts(result: Diagnosis) -> list[tuple[str, str]]:
     if result.seconds:
         rows.append(("time", f"{result.seconds:.0f} s"))
     return rows
+
+
+def _steps(steps: Sequence[SelectionStep]) -> list[str]:
+    """Return what each step did, and why; by chance alone, where it has a screening of its own."""
+    said, last = [], None
+    for step in steps:
+        what = f"added {words(step.added)}: " if step.added else "" if step.screening is last else "nothing added: "
+        n, p = len(step.screening.scores), step.screening.family_p
+        chance = "" if step.screening is last else f"; chance alone: p = {p:.2g} over {n} candidates"
+        said.append(f"{what}{step.reason}{chance}")
+        last = step.screening
+    return said
 
 
 def _described(observations: Sequence[Observation]) -> str:

@@ -24,7 +24,7 @@ from livedeform.report.diagnosis.tables import (
     rivals_in,
 )
 from livedeform.report.page import Table, Tile, Verdict, write_page
-from livedeform.report.text import MM, mm, words
+from livedeform.report.text import MM, less, less_between, mm, words
 
 
 def write_report(out: Path, result: Diagnosis, experiment: Experiment) -> Path:
@@ -99,9 +99,7 @@ def _numbers_behind(diagnosis: Mapping[str, Any]) -> str:
     if not diagnosis["effects"]:
         return f"Held-out rmse {mm(before, digits)} mm; the measuring noise alone would leave {noise}."
     low, high = diagnosis.get("improvement_interval") or (float("nan"), float("nan"))
-    gain = (
-        f"−{100 * (1 - after / before):.0f} %, 95 % interval, these recordings: {100 * low:.0f} to {100 * high:.0f} %"
-    )
+    gain = f"{less(1.0 - after / before)}; 95 % interval, these recordings: {less_between(low, high)}"
     errors = f"{mm(before, digits)} mm before, {mm(after, digits)} mm after ({gain})"
     return f"Held-out rmse {errors}; the measuring noise alone leaves {noise}. {next_recording(diagnosis)}"
 
@@ -113,8 +111,8 @@ def next_recording(diagnosis: Mapping[str, Any]) -> str:
         return "Another recording: one that was held out does not say how recordings differ."
     (low, high), gain = found["error_after_rmse"], found["improvement"]
     return (
-        f"Another recording like these {found['recordings']}: rmse {mm(low)} to {mm(high)} mm, improvement "
-        f"{100 * gain[0]:.0f} to {100 * gain[1]:.0f} % (95 %)."
+        f"Another recording like these {found['recordings']}: rmse {mm(low)} to {mm(high)} mm, "
+        f"{less_between(*gain)} (95 %)."
     )
 
 
