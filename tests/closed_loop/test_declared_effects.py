@@ -140,7 +140,7 @@ def test_what_differs_from_a_declared_effect_is_told_as_that() -> None:
     row = pytest.importorskip("livedeform.campaign.row")  # needs pyarrow
     found = found_in([toy.effect("softening", rate=0.01)], [])
     assert found.headline == "Traced to another softening than declared"
-    assert found.text.endswith("softening takes the place of the declared one (rate 0.01), and may be nothing.")
+    assert found.text.endswith("softening takes the place of the declared one (rate 0.01 1/s), and may be nothing.")
     document = as_json(found)
     assert document["effects"][0]["parameters"]["rate"]["declared"] == 0.01
     assert [c["name"] for c in document["candidates"] if c["declared"]] == ["softening"]

@@ -22,6 +22,7 @@ import toy_loop as loop
 
 from livedeform.closed_loop.assessment.held_out import errors_of
 from livedeform.closed_loop.assessment.next_experiment import ProbeReach
+from livedeform.closed_loop.candidates import all_effects
 from livedeform.closed_loop.diagnosis import Diagnosis
 from livedeform.closed_loop.evidence.observation import Observation
 from livedeform.closed_loop.forward import Column, Run
@@ -246,3 +247,15 @@ def test_the_page_says_the_noise_of_each_recording(shown: Shown):
     card = shown.html.split("Noise of each recording")[1].split("</section>")[0]
     rows = re.findall(r"<tr>\s*<td[^>]*>(.*?)</td><td[^>]*>(.*?)</td>", card)
     assert rows == [("fit", "fitted"), ("test", "held out"), ("again", "held out")]
+
+
+def test_page_and_terminal_give_values_with_sigmas_and_units(
+    show: Callable[[Diagnosis], Shown], traced: Diagnosis
+) -> None:
+    shown = show(traced)
+    for effect in shown.document["effects"]:
+        info = all_effects()[effect["name"]]
+        for name, entry in effect["parameters"].items():
+            said = f"{name} = {info.in_words(name, entry['value'], entry['sigma'])}"
+            assert said in shown.terminal and said in shown.html and "±" in said
+    assert " s" in info.in_words("tau", [2.0]) and info.in_words("g", [0.3, 0.1]) == "(0.3, 0.1)"

@@ -448,7 +448,7 @@ def in_their_place(model: FittedModel, covariance: Array | None) -> str:
         if a.candidate.declared is None:
             continue
         values = a.candidate.declared.values.items()
-        text = ", ".join(f"{name} {' '.join(f'{v:.4g}' for v in np.ravel(value))}" for name, value in values)
+        text = ", ".join(f"{name} {a.candidate.info.in_words(name, value)}" for name, value in values)
         i = a.candidate.strengths
         sigma = np.inf if covariance is None else np.sqrt(np.diag(covariance)[here])[i]
         off = bool(np.all(np.abs(a.candidate.off(a.z)[i]) < SIGMAS * sigma))

@@ -6,12 +6,10 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import numpy as np
 import typer
 
 if TYPE_CHECKING:
     from livedeform.closed_loop.diagnosis import Diagnosis
-    from livedeform.common.types import Array
     from livedeform.compare_node.metrics import RunMetrics, Statistic
 
 
@@ -54,6 +52,7 @@ def tell_metrics(metrics: RunMetrics, out: Path) -> None:
 def tell_diagnosis(result: Diagnosis, out: Path) -> None:
     """The verdict, the effects with values and sigmas, the error before and after on what was held out, and how to run
     the fitted model on that."""
+    from livedeform.closed_loop.candidates import all_effects
     from livedeform.closed_loop.write import as_json
     from livedeform.report.diagnosis.collect import commands
     from livedeform.report.diagnosis.page import next_recording
@@ -63,8 +62,9 @@ def tell_diagnosis(result: Diagnosis, out: Path) -> None:
     for doubt in result.doubts:
         typer.echo(f"  doubt: {doubt}")
     for effect in result.effects:
-        values = ", ".join(f"{name} = {_numbers(value)}" for name, value in effect.values.items())
-        typer.echo(f"  {effect.name}: {values}")
+        said = all_effects()[effect.name].in_words
+        values = [f"{name} = {said(name, value, effect.sigmas.get(name))}" for name, value in effect.values.items()]
+        typer.echo(f"  {effect.name}: {', '.join(values)}")
     before, after = result.before, result.after
     typer.echo(f"  rmse_mm before {_mm(before.rmse).strip()}, after {_mm(after.rmse).strip()} on what was held out")
     typer.echo(f"  noise_mm {_mm(result.floor).strip()}, {after.n} errors")
@@ -87,10 +87,6 @@ def judge(metrics: RunMetrics, limit: float | None) -> None:
     if limit is not None and not rmse.value <= limit:
         typer.echo(f"failed: the rmse is not within {limit * 1e3:g} mm", err=True)
         raise typer.Exit(1)
-
-
-def _numbers(value: Array) -> str:
-    return " ".join(f"{v:.4g}" for v in np.atleast_1d(value).ravel())
 
 
 def _mm(value: float) -> str:

@@ -15,6 +15,7 @@ from types import ModuleType
 from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from livedeform.common.errors import InputError
 from livedeform.common.published_effects import EFFECT_PARAMETERS
@@ -244,6 +245,19 @@ class EffectInfo:
                 return parameter
         known = ", ".join(p.name for p in (*self.parameters, *self.optional))
         raise InputError(f"effect '{self.name}' has no parameter '{name}'", remedy=f"its parameters are {known}")
+
+    def in_words(self, name: str, value: ArrayLike, sigma: ArrayLike | None = None) -> str:
+        """Return the value of a parameter, a number or a list, as text, with one sigma where it has one, and its
+        unit."""
+        values = np.asarray(value, float)
+        sigmas = (
+            np.full(values.shape, np.nan) if sigma is None else np.broadcast_to(np.asarray(sigma, float), values.shape)
+        )
+        pairs = zip(values.ravel(), sigmas.ravel(), strict=True)
+        parts = [f"{v:.4g} ± {s:.2g}" if np.isfinite(s) else f"{v:.4g}" for v, s in pairs]
+        unit = self.parameter(name).unit
+        text = parts[0] if values.ndim == 0 else "(" + ", ".join(parts) + ")"
+        return text if unit in ("", "-", "1") else f"{text} {unit}"
 
 
 def effects_in(package: str, path: Iterable[str]) -> dict[str, ModuleType]:

@@ -154,28 +154,14 @@ class _Cause:
 
 
 def _cause(effect: Mapping[str, Any], evidence: DiagnosisEvidence) -> _Cause:
-    info = evidence.infos.get(effect["name"])
-    values = []
-    for name, entry in effect["parameters"].items():
-        unit = next((p.unit for p in (*info.parameters, *info.optional) if p.name == name), "") if info else ""
-        text = f"{name} = {_numbers(entry['value'], entry.get('sigma'))} {unit}"
-        values.append(text.removesuffix(" -").removesuffix(" 1").rstrip())
-    card = ("", "", "", "")
-    if info is not None:
-        summary = info.summary[:1].upper() + info.summary[1:].rstrip(".") + "."
-        before = [f"{n} {_numbers(p['declared'], None)}" for n, p in effect["parameters"].items() if "declared" in p]
-        if before:
-            summary = f"Otherwise than declared ({', '.join(before)}). {summary}"
-        card = (summary, info.equation, info.source, info.acts_on)
+    info, given = evidence.infos[effect["name"]], effect["parameters"]
+    values = [f"{name} = {info.in_words(name, p['value'], p.get('sigma'))}" for name, p in given.items()]
+    summary = info.summary[:1].upper() + info.summary[1:].rstrip(".") + "."
+    before = [f"{name} {info.in_words(name, p['declared'])}" for name, p in given.items() if "declared" in p]
+    if before:
+        summary = f"Otherwise than declared ({', '.join(before)}). {summary}"
+    card = (summary, info.equation, info.source, info.acts_on)
     return _Cause(words(effect["name"]), *card, tuple(values))
-
-
-def _numbers(value: Any, sigma: Any) -> str:
-    values, sigmas = np.atleast_1d(np.asarray(value, float)), np.atleast_1d(np.asarray(sigma, float))
-    if sigma is None or sigmas.shape != values.shape:
-        sigmas = np.full(values.shape, np.nan)
-    parts = [f"{v:.4g} ± {s:.2g}" if np.isfinite(s) else f"{v:.4g}" for v, s in zip(values, sigmas, strict=True)]
-    return parts[0] if np.ndim(value) == 0 else "(" + ", ".join(parts) + ")"
 
 
 def _doubts(diagnosis: Mapping[str, Any], evidence: DiagnosisEvidence) -> list[str]:
