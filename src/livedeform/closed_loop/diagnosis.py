@@ -165,10 +165,12 @@ def elements_notes(inputs: Inputs, others: Baselines | None, rmse: float) -> lis
     """Say what smaller elements would do to the error that is left, if a better mesh was solved."""
     if others is None or not inputs.uncertain.correction.points:
         return []
-    return [
+    said = (
         f"of the {1e3 * rmse:.3f} mm that are left on held-out data, elements half as large under the probe leave "
-        f"{1e3 * others.finer_after:.3f} mm: mesh the experiment more finely (element_size) if that matters"
-    ]
+        f"{1e3 * others.finer_after:.3f} mm"
+    )
+    better = others.finer_after < rmse
+    return [f"{said}: mesh the experiment more finely (element_size) if that matters" if better else said]
 
 
 def noise_notes(observations: Sequence[Observation], settings: VerdictSettings) -> list[str]:

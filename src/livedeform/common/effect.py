@@ -124,7 +124,8 @@ class Parameter:
     fits a coordinate z of each number: the number itself, its logarithm or its inverse (``scale``), counted from the
     neutral one. In units of z: ``sigma`` of the wide default prior; ``step``, small but well above the solver's
     tolerance (None: a share of sigma); ``kick``, where the model changes its kind at the neutral value (a bond becomes
-    a spring, a contact begins to slide), so that columns are taken there and fits begin no nearer than half of it.
+    a spring, a contact begins to slide), so that columns are taken there and fits begin no nearer than half of it, and
+    the power by which what it does ``grows`` up to there.
     ``known_to``: one sigma in ``unit`` to which the neutral value is never known better in any experiment.
     ``stated_by``: the experiment's key whose ``_sigma`` is this parameter's; one whose neutral value is 1 is relative
     to the key's value.
@@ -145,6 +146,7 @@ class Parameter:
     scale: Scale = "linear"
     step: float | None = None
     kick: float | Callable[[Surroundings], float] = 0.0
+    grows: float = 1.0
     known_to: float = 0.0
     stated_by: str = ""
     placed_by_elements: tuple[int, ...] = ()

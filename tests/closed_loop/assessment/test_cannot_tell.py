@@ -151,6 +151,24 @@ def test_the_detectable_size_is_seen_in_95_of_100(name, draws):
     assert seen(0.5 * found.size) < 0.7
 
 
+def test_a_detectable_size_below_the_kick_is_by_the_power_that_the_card_says() -> None:
+    """Along the secant, a strip of a thousandth of the base seemed to be seen."""
+    o, model = toy.record([], seed=0, n=24), toy.ToyModel(toy.ToyBody(PLACES))
+    debonding = toy.candidates(PLACES, ["base_debonding"])["base_debonding"]
+    columns = dictionary_columns([debonding])
+    problem, _ = ProblemFactory([o], toy.SETTINGS.allowance).at(
+        FittedModel(toy.uncertain(PLACES)), model.run([], [o], ())[0], ()
+    )
+    J = 1e-2 * np.random.default_rng(0).normal(size=(len(problem.residual), len(columns)))
+    fraction = debonding.info.parameters[-1]
+    straight = replace(debonding, info=replace(debonding.info, parameters=(replace(fraction, grows=1.0),)))
+    bent = replace(debonding, info=replace(debonding.info, parameters=(fraction,)))
+    (along,), (by_power,) = (Power(toy.SETTINGS)(problem, J, [c]).values() for c in (straight, bent))
+    kick = float(debonding.kick[1])
+    assert 0.0 < along.size < kick and by_power.moves == along.moves
+    assert by_power.size == pytest.approx(kick * (along.size / kick) ** (2.0 / 3.0))
+
+
 def test_a_candidate_is_judged_by_its_own_columns() -> None:
     """The others count only in how many are looked for."""
     o, model = toy.record([], seed=0, n=24), toy.ToyModel(toy.ToyBody(PLACES))

@@ -277,3 +277,17 @@ def test_a_base_that_begins_to_come_free_is_seen_on_springs_too(slips):
     assert 0.3 < size < 5.0  # measured 2.23, 1.63
     cosine = found @ difference / (np.linalg.norm(found) * np.linalg.norm(difference))
     assert cosine > 0.85  # measured 0.905, 0.950
+
+
+@pytest.mark.parametrize("direction", [0.0, 2.0])
+def test_what_comes_free_moves_markers_by_the_power_that_its_card_says(direction):
+    """Up to its kick, along the secant to which columns are taken."""
+    o, body = phantom.moments([0.5]), Body(phantom.setting(4, probe=None, gravity=np.array([3.0, 0.0, -9.81])))
+    candidate = toy.candidates(toy.markers(), ["base_debonding"])["base_debonding"]
+    held, kick = body.simulate([], o, ()).points, float(candidate.kick[1])
+    moved = [
+        np.linalg.norm(body.simulate([candidate.values(np.array([direction, z]))], o, ()).points - held)
+        for z in (kick, kick / 4.0)
+    ]
+    power = np.log(moved[0] / moved[1]) / np.log(4.0)
+    assert abs(power - candidate.info.parameter("fraction").grows) < 0.2  # measured 1.43, 1.60

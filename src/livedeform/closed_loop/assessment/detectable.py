@@ -5,7 +5,8 @@ information I has the gain (sqrt(I) z + e)^2 with e ~ N(0, 1), and in the left-o
 -z^2 K + 2 z K / sqrt(I) e + cost with K = sum (I - I_s), the information that is new in each. It is added if the gain
 is beyond chance, at the family-wise level of all candidates, and the score beyond what an addition needs. The smallest
 z for which both happen with 95 % is what could have been seen. Where the tangent at zero is not to be trusted the
-columns are secants to the candidate's kick (`forward.Column`), and so is z.
+columns are secants to the candidate's kick (`forward.Column`), and so is z: what grows by another power than that
+(``grows`` on its card) is as large as what does as much.
 
 It matters if it would move the markers, beside a rigid motion of all of them, by a stated share of how the body moved
 or by the experiment's threshold.
@@ -196,10 +197,20 @@ def _size(candidate: Candidate, entry: DictionaryEntry, i: np.ndarray, e: Array,
     amounts = []
     for j, share in zip(i, e, strict=True):
         c = candidate.coordinates[candidate.amplitudes[j]]
-        side = z * share if c.lower <= z * share <= c.upper else -z * share
+        far = _by_its_power(candidate, candidate.amplitudes[j], z * share)
+        side = far if c.lower <= far <= c.upper else -far
         value, none = c.value(side), c.value(0.0)
         amounts.append(abs(value - none) if np.isfinite(none) else abs(value))
     return float(np.linalg.norm(amounts))
+
+
+def _by_its_power(candidate: Candidate, k: int, z: float) -> float:
+    """Return which coordinate number ``k`` of a candidate does what ``z`` does along the secant to its kick, where what
+    it does grows by another power."""
+    kick, grows = float(candidate.kick[k]), candidate.info.parameter(candidate.coordinates[k].parameter).grows
+    if candidate.undeclared is not None or not kick or grows == 1.0:
+        return z
+    return kick * float(np.sign(z / kick) * abs(z / kick) ** (1.0 / grows))
 
 
 def _apart_from_registration(problem: Problem, columns: Array) -> Array:

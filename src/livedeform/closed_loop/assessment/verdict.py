@@ -213,9 +213,14 @@ def _over(names: Sequence[str]) -> str:
     )
 
 
+def chance(p: float) -> str:
+    """Return a probability as text; none is zero."""
+    return f"p = {p:.2g}" if p > 0.0 else "p < 1e-300"  # it was too small for a number
+
+
 def _left(left: Left, loud: bool, floor: float, settings: VerdictSettings) -> str:
     """Say how much the given model leaves."""
-    size, numbers = f"{1e3 * left.excess:.3f} mm rms", f"p = {left.p_value:.2g}, chi2 per datum {left.chi2:.2f}"
+    size, numbers = f"{1e3 * left.excess:.3f} mm rms", f"{chance(left.p_value)}, chi2 per datum {left.chi2:.2f}"
     if left.rough:
         return f"What is left swings: chi2 per datum is {left.chi2:.1f}, {size} of it smooth."
     if loud:

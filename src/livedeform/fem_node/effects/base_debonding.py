@@ -30,7 +30,9 @@ INFO = EffectInfo(
     source="definition",
     parameters=(
         Parameter("direction", "rad", start=0.0, lower=-6.3, upper=6.3, sigma=3.0),
-        Parameter("fraction", "1", start=0.15, lower=0.0, upper=0.9, sigma=0.3, neutral=0.0, step=0.05, kick=0.12),
+        Parameter(
+            "fraction", "1", start=0.15, lower=0.0, upper=0.9, sigma=0.3, neutral=0.0, step=0.05, kick=0.12, grows=1.5
+        ),
     ),
     shown_by="an off-centre press, markers near the foot",
     confused_with=("base_slip", "gravity_tilt"),

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from livedeform.closed_loop.assessment.held_out import RecordingErrors
-from livedeform.closed_loop.assessment.verdict import EVIDENCE, share_of_evidence
+from livedeform.closed_loop.assessment.verdict import EVIDENCE, chance, share_of_evidence
 from livedeform.closed_loop.candidates import Coordinate, all_effects
 from livedeform.closed_loop.diagnosis import Diagnosis
 from livedeform.closed_loop.evidence.measuring_noise import median
@@ -162,7 +162,7 @@ def facts(result: Diagnosis) -> list[tuple[str, str]]:
     rows.append(
         (
             "model discrepancy",
-            f"p = {result.discrepancy.p_value:.2g}, {1e3 * result.discrepancy.excess:.3f} mm rms beyond noise",
+            f"{chance(result.discrepancy.p_value)}, {1e3 * result.discrepancy.excess:.3f} mm rms beyond noise",
         )
     )
     rows += [("note", note) for note in result.notes]
@@ -177,8 +177,8 @@ def _steps(steps: Sequence[SelectionStep]) -> list[str]:
     for step in steps:
         what = f"added {words(step.added)}: " if step.added else "" if step.screening is last else "nothing added: "
         n, p = len(step.screening.scores), step.screening.family_p
-        chance = "" if step.screening is last else f"; chance alone: p = {p:.2g} over {n} candidates"
-        said.append(f"{what}{step.reason}{chance}")
+        by_chance = "" if step.screening is last else f"; chance alone: {chance(p)} over {n} candidates"
+        said.append(f"{what}{step.reason}{by_chance}")
         last = step.screening
     return said
 
