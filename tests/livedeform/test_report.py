@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -14,13 +15,16 @@ from plotly.offline import get_plotlyjs
 
 from livedeform.common.frames import transform
 from livedeform.common.types import Array, CameraCalibration, Image, PredictedMarkers, Wrench
+from livedeform.compare_node.judgement import judge
 from livedeform.compare_node.metrics import run_metrics
 from livedeform.compare_node.residual import Residual
 from livedeform.fem_node.mesh.structured import hemi_ellipsoid_mesh
+from livedeform.report.run.charts import per_marker_chart
 from livedeform.report.run.counts import describe_counts
 from livedeform.report.run.evidence import RunEvidence, SurfaceMesh
 from livedeform.report.run.moments import DEEPEST, interesting_moments
 from livedeform.report.run.page import write_run_page
+from livedeform.report.run.summary import RunSummary
 from livedeform.stereo_node.camera.rig import StereoRig
 
 RNG = np.random.default_rng(7)
@@ -135,3 +139,51 @@ def test_moments_are_rest_press_and_worst() -> None:
 def test_nothing_to_judge_is_said(tmp_path: Path) -> None:
     text = write_run_page(tmp_path / "r.html", RunEvidence(0, [], []), experiment()).read_text()
     assert "There is nothing to judge" in text
+
+
+def test_a_single_frame_is_seen_in_the_chart(tmp_path: Path) -> None:
+    """It was a line of one point, which is nothing."""
+    for n, mode in ((1, "lines+markers"), (40, "lines")):
+        e = evidence()
+        one = replace(e, residuals=e.residuals[:n], predictions=e.predictions[:n], wrenches=e.wrenches[:n])
+        text = write_run_page(tmp_path / "report.html", one, experiment()).read_text()
+        assert {trace["mode"] for trace in page_data.charts(text)["over-time"]} == {mode}
+
+
+@pytest.mark.parametrize("scale", [1e-3, 1e-2, 1.0])
+def test_small_errors_are_not_shown_as_none(tmp_path: Path, scale: float) -> None:
+    """Of a run within 1 um page and verdict said "0.00 mm, 0.00 to 0.00"."""
+    e = evidence()
+    near = [replace(r, measured=r.predicted + scale * r.errors) for r in e.residuals]
+    text = write_run_page(tmp_path / "report.html", replace(e, residuals=near), experiment()).read_text()
+    metrics = run_metrics(near, 0.005)
+    tiles = page_data.tiles(text)
+    for name, value in (
+        ("rmse", metrics.rmse.value),
+        ("mean error", metrics.mean.value),
+        ("largest error", metrics.max),
+    ):
+        assert float(tiles[name].split()[0]) == pytest.approx(1e3 * value, rel=0.06)
+    said = re.search(r"rmse ([0-9.]+) mm", judge(metrics).because)
+    assert said is not None and float(said[1]) == pytest.approx(1e3 * metrics.rmse.value, rel=0.06)
+
+
+def test_whiskers_are_of_each_markers_own_errors() -> None:
+    """As they were marker by marker, frame by frame, which took 18 s for 200 markers in 6000 frames."""
+    e = evidence()
+    seen = [np.flatnonzero((r.ids + k) % 5 > 0) for k, r in enumerate(e.residuals)]
+    some = [
+        Residual(r.stamp_ns, r.ids[at], r.measured[at], r.predicted[at], r.covariances[at])
+        for r, at in zip(e.residuals, seen, strict=True)
+    ]
+    metrics = run_metrics(some, 0.005)
+    run = RunSummary(replace(e, residuals=some), experiment(), metrics, np.zeros(40), np.zeros(40))
+    ids = np.array([m.id for m in metrics.markers], np.uint32)
+    found = per_marker_chart(run)
+    assert found is not None
+    whiskers = dict(zip(found.figure.data[0].x, found.figure.data[0].error_y.array, strict=True))
+    for marker in ids[:5]:
+        squares = np.concatenate([r.distances[r.ids == marker] ** 2 for r in some])
+        n_effective = max(1.0, metrics.n_effective * len(squares) / metrics.n_frames)
+        half = 1.96 * squares.std() / (2.0 * np.sqrt(squares.mean() * n_effective))
+        assert whiskers[str(marker)] == pytest.approx(1e3 * half)

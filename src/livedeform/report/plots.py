@@ -21,6 +21,7 @@ BLUE, ORANGE, GREEN, VERMILLION, SKY, GREY = (
 )  # fmt: skip
 SCALE, viridis = "Viridis", colormaps["viridis"]
 MM = 1e3
+FEW_POINTS = 20  # of one line; up to these, each has a mark: a single one has no line
 MAX_POINTS = 3000  # of one line; more are thinned out for the page, never for the numbers
 
 
@@ -66,7 +67,7 @@ def error_over_time(
             y=values,
             customdata=None if line.weights is None else _thinned(line.seconds, line.weights)[1],
             name=line.name,
-            mode="lines",
+            mode=_mode(seconds),
             line={"color": line.colour, "width": 2, "dash": line.dash},
             hovertemplate="%{y:.3f} mm",
         )
@@ -80,7 +81,7 @@ def error_over_time(
     if second is not None:
         seconds, values = _thinned(second.seconds, second.values)
         below = {"line": {"color": second.colour, "width": 1.6}, "yaxis": "y2", "hovertemplate": "%{y:.3f}"}
-        figure.add_scatter(x=seconds, y=values, name=second.name, mode="lines", **below)
+        figure.add_scatter(x=seconds, y=values, name=second.name, mode=_mode(seconds), **below)
         layout |= {
             "height": 460,
             "yaxis": layout["yaxis"] | {"domain": [0.36, 1.0]},
@@ -89,6 +90,10 @@ def error_over_time(
         layout["xaxis"] |= {"anchor": "y2"}
     figure.update_layout(**layout)
     return figure
+
+
+def _mode(seconds: Array) -> str:
+    return "lines+markers" if len(seconds) <= FEW_POINTS else "lines"
 
 
 def _add_threshold(figure: go.Figure, lines: Sequence[Line], threshold: float) -> None:

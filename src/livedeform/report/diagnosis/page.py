@@ -24,7 +24,7 @@ from livedeform.report.diagnosis.tables import (
     rivals_in,
 )
 from livedeform.report.page import Table, Tile, Verdict, write_page
-from livedeform.report.text import MM, mm, words
+from livedeform.report.text import decimals, mm, significant, words
 
 
 def write_report(out: Path, result: Diagnosis, experiment: Experiment) -> Path:
@@ -87,8 +87,7 @@ def diagnosis_verdict(diagnosis: Mapping[str, Any]) -> Verdict:
 
 def _digits(diagnosis: Mapping[str, Any]) -> int:
     """Decimals (mm) that the page's first numbers need, all alike: two significant ones of the smallest, if not two."""
-    smallest = min(diagnosis["error_before"]["rmse"], diagnosis["error_after"]["rmse"], diagnosis["noise_floor"])
-    return 2 if not smallest > 0.0 else int(np.clip(1 - np.floor(np.log10(smallest * MM)), 2, 6))
+    return decimals(diagnosis["error_before"]["rmse"], diagnosis["error_after"]["rmse"], diagnosis["noise_floor"])
 
 
 def _numbers_behind(diagnosis: Mapping[str, Any]) -> str:
@@ -98,12 +97,20 @@ def _numbers_behind(diagnosis: Mapping[str, Any]) -> str:
     noise = f"{mm(floor, digits)} mm"
     if not diagnosis["effects"]:
         return f"Held-out rmse {mm(before, digits)} mm; the measuring noise alone would leave {noise}."
-    low, high = diagnosis.get("improvement_interval") or (float("nan"), float("nan"))
-    gain = (
-        f"−{100 * (1 - after / before):.0f} %, 95 % interval, these recordings: {100 * low:.0f} to {100 * high:.0f} %"
-    )
-    errors = f"{mm(before, digits)} mm before, {mm(after, digits)} mm after ({gain})"
+    errors = f"{mm(before, digits)} mm before, {mm(after, digits)} mm after{_gain(diagnosis)}"
     return f"Held-out rmse {errors}; the measuring noise alone leaves {noise}. {next_recording(diagnosis)}"
+
+
+def _gain(diagnosis: Mapping[str, Any]) -> str:
+    """Say by how much the error changed, in brackets, and between which ends its improvement lies."""
+    before, after = diagnosis["error_before"]["rmse"], diagnosis["error_after"]["rmse"]
+    if not before > 0.0 or not np.isfinite(after):
+        return ""
+    change = f"{100 * (after / before - 1):+.0f} %".replace("-", "−")
+    low, high = diagnosis.get("improvement_interval") or (float("nan"), float("nan"))
+    if not np.isfinite([low, high]).all():
+        return f" ({change}; these recordings do not tell between which ends)"
+    return f" ({change}, 95 % interval, these recordings: {100 * low:.0f} to {100 * high:.0f} %)"
 
 
 def next_recording(diagnosis: Mapping[str, Any]) -> str:
@@ -112,9 +119,10 @@ def next_recording(diagnosis: Mapping[str, Any]) -> str:
     if not isinstance(found, Mapping):
         return "Another recording: one that was held out does not say how recordings differ."
     (low, high), gain = found["error_after_rmse"], found["improvement"]
+    digits = decimals(low, high)
     return (
-        f"Another recording like these {found['recordings']}: rmse {mm(low)} to {mm(high)} mm, improvement "
-        f"{100 * gain[0]:.0f} to {100 * gain[1]:.0f} % (95 %)."
+        f"Another recording like these {found['recordings']}: rmse {mm(low, digits)} to {mm(high, digits)} mm, "
+        f"improvement {100 * gain[0]:.0f} to {100 * gain[1]:.0f} % (95 %)."
     )
 
 
@@ -176,8 +184,15 @@ def _numbers(value: Any, sigma: Any) -> str:
     values, sigmas = np.atleast_1d(np.asarray(value, float)), np.atleast_1d(np.asarray(sigma, float))
     if sigma is None or sigmas.shape != values.shape:
         sigmas = np.full(values.shape, np.nan)
-    parts = [f"{v:.4g} ± {s:.2g}" if np.isfinite(s) else f"{v:.4g}" for v, s in zip(values, sigmas, strict=True)]
+    parts = [_number(v, s) for v, s in zip(values.ravel(), sigmas.ravel(), strict=True)]
     return parts[0] if np.ndim(value) == 0 else "(" + ", ".join(parts) + ")"
+
+
+def _number(value: float, sigma: float) -> str:
+    """Say a value with as many digits as its sigma has a say in; without one that is 0, which nothing is known to."""
+    if not np.isfinite(sigma) or sigma <= 0.0:
+        return f"{value:.4g}"
+    return f"{value:.{significant(abs(value), sigma, 4)}g} ± {sigma:.2g}"
 
 
 def _doubts(diagnosis: Mapping[str, Any], evidence: DiagnosisEvidence) -> list[str]:
