@@ -13,12 +13,16 @@ import page_data
 import pytest
 from plotly.offline import get_plotlyjs
 
+from livedeform.common.errors import InputError
 from livedeform.common.frames import transform
 from livedeform.common.types import Array, CameraCalibration, Image, PredictedMarkers, Wrench
 from livedeform.compare_node.judgement import judge
 from livedeform.compare_node.metrics import run_metrics
 from livedeform.compare_node.residual import Residual
 from livedeform.fem_node.mesh.structured import hemi_ellipsoid_mesh
+from livedeform.report import plots
+from livedeform.report.playback import Playback, ViewedMoment, figure
+from livedeform.report.run import read
 from livedeform.report.run.charts import per_marker_chart
 from livedeform.report.run.counts import describe_counts
 from livedeform.report.run.evidence import RunEvidence, SurfaceMesh
@@ -187,3 +191,36 @@ def test_whiskers_are_of_each_markers_own_errors() -> None:
         n_effective = max(1.0, metrics.n_effective * len(squares) / metrics.n_frames)
         half = 1.96 * squares.std() / (2.0 * np.sqrt(squares.mean() * n_effective))
         assert whiskers[str(marker)] == pytest.approx(1e3 * half)
+
+
+@pytest.mark.parametrize("at", [2500, 2501, 6998, 7000])
+def test_a_peak_of_a_single_frame_is_in_the_chart(at: int) -> None:
+    """Of more than 3000 frames every second or third was shown, and the largest error often was not."""
+    values = np.full(7001, 0.1)
+    values[at], values[at - 5] = 3.0, np.nan
+    line = plots.Line("rmse", 0.01 * np.arange(7001), values, plots.BLUE, weights=np.arange(7001.0))
+    shown = plots.error_over_time([line], None, {}).data[0]
+    assert len(shown.x) <= plots.MAX_POINTS and max(shown.y) == 3.0
+    assert np.all(np.diff(shown.x) > 0.0) and shown.customdata[np.nanargmax(shown.y)] == at
+
+
+def test_moments_that_are_near_have_names_of_their_own() -> None:
+    """The slider finds them by these: 4 ms apart, it showed two of three moments as another."""
+    e = evidence(10)
+    body = e.surfaces(e.residuals[0].stamp_ns)
+    assert body is not None
+    none, no_rows = np.zeros((0, 3)), np.zeros((0, 3), np.int64)
+    for step, first in ((0.004, "0.000"), (0.1, "0.00")):
+        moments = [
+            ViewedMoment(k * step, body.vertices, r, None, np.zeros(0, np.int64)) for k, r in enumerate(e.residuals)
+        ]
+        names = [frame.name for frame in figure(Playback(moments, body.triangles, none, no_rows, none)).frames]
+        assert len(set(names)) == 10 and names[0] == first
+
+
+@pytest.mark.parametrize("text", ["{", "", "[1]", "null"])
+def test_torn_metrics_are_one_line(tmp_path: Path, text: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "metrics.json").write_text(text)
+    monkeypatch.setattr(read, "load_recording", lambda *_: None)  # it is whole
+    with pytest.raises(InputError, match="is not what livedeform run wrote"):
+        read.load_evidence(tmp_path, experiment())

@@ -117,7 +117,7 @@ def document(s: Shared, evidence: Sequence[KeptEvidence]) -> dict[str, Any]:
         "at": at,
         "log_evidence": s.gain,
         "said": [
-            *(f"{p['name']} {interval_words(p['value'], *p['interval_95'])}".lstrip() for p in parameters),
+            *(f"{p['name']} {interval_words(p['value'], *p['interval_95'])}" for p in parameters),
             *(f"at {p['name']} {p['value']:.3g}" for p in at),
         ],
         "scatter_said": [interval_words(p["value"], *p["takes_95"]).partition(" ")[2] for p in parameters],
@@ -131,6 +131,8 @@ def _usual_shape(shapes: Sequence[Sequence[KeptShape]]) -> list[dict[str, Any]]:
 
 
 def _name(label: Label | KeptShape) -> str:
+    if not label.parameter:  # an effect that is switched as a whole: how much of it there is
+        return "amount"
     return label.parameter if label.index < 0 else f"{label.parameter}[{label.index}]"
 
 

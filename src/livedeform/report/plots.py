@@ -61,11 +61,12 @@ def error_over_time(
     """Errors (mm) over the recording's time, the threshold (m), vertical marks; ``second`` is drawn below."""
     figure = go.Figure()
     for line in lines:
-        seconds, values = _thinned(line.seconds, line.values)
+        shown = _shown(line.values)
+        seconds, values = line.seconds[shown], line.values[shown]
         figure.add_scatter(
             x=seconds,
             y=values,
-            customdata=None if line.weights is None else _thinned(line.seconds, line.weights)[1],
+            customdata=None if line.weights is None else line.weights[shown],
             name=line.name,
             mode=_mode(seconds),
             line={"color": line.colour, "width": 2, "dash": line.dash},
@@ -79,7 +80,8 @@ def error_over_time(
     layout["xaxis"] = {"title": "time since the recording's start (s)"}
     layout["yaxis"] = {"title": "error (mm)", "rangemode": "tozero"}
     if second is not None:
-        seconds, values = _thinned(second.seconds, second.values)
+        shown = _shown(second.values)
+        seconds, values = second.seconds[shown], second.values[shown]
         below = {"line": {"color": second.colour, "width": 1.6}, "yaxis": "y2", "hovertemplate": "%{y:.3f}"}
         figure.add_scatter(x=seconds, y=values, name=second.name, mode=_mode(seconds), **below)
         layout |= {
@@ -241,9 +243,16 @@ def _rgb(colour: Array) -> str:
     return "rgb({:.0f},{:.0f},{:.0f})".format(*colour)
 
 
-def _thinned(seconds: Array, values: Array) -> tuple[Array, Array]:
-    step = max(1, -(-len(seconds) // MAX_POINTS))
-    return seconds[::step], values[::step]
+def _shown(values: Array) -> NDArray[np.int64]:
+    """Return the rows of a line that the page has: all of few; else of each stretch the lowest and the highest, so that
+    no peak is left out."""
+    n = len(values)
+    if n <= MAX_POINTS:
+        return np.arange(n)
+    stretches = np.array_split(np.arange(n), MAX_POINTS // 2)
+    low, high = np.nan_to_num(values, nan=np.inf), np.nan_to_num(values, nan=-np.inf)
+    ends = [(rows[np.argmin(low[rows])], rows[np.argmax(high[rows])]) for rows in stretches]
+    return np.unique(ends)
 
 
 def base_layout(height: int) -> dict[str, Any]:
