@@ -120,6 +120,21 @@ def test_errors_in_the_middle_leave_the_others_done_and_are_done_again_when_aske
     assert (out / "index.html").is_file()
 
 
+@pytest.mark.parametrize("left", [0, 100])
+def test_a_torn_row_is_done_again(tmp_path: Path, left: int) -> None:
+    """It was "failed" in the table and the page for ever, "0 failed" on the terminal, and the exit code was 0."""
+    source, out = lab.write_laboratory(tmp_path / "lab.2026", 1, 2), tmp_path / "out"
+    run_campaign(CampaignOptions(source, out, 1), lambda *_: None)
+    whole = tables(out)
+    torn = next(out.glob("jobs/*/row.parquet"))
+    torn.write_bytes(torn.read_bytes()[:left])
+    said: list[str] = []
+    result = run_campaign(CampaignOptions(source, out, 1), lambda text, _: said.append(text))
+    assert (result.n_before, result.n_now, result.problems) == (1, 1, {}) and tables(out) == whole
+    assert any("is done again: its row cannot be read" in line for line in said)
+    assert "<title>lab.2026</title>" in (out / "index.html").read_text()
+
+
 @pytest.mark.slow
 def test_one_two_and_four_workers_give_the_same_table(tmp_path: Path) -> None:
     source = lab.write_laboratory(tmp_path / "lab", 2, 6)

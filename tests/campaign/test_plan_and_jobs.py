@@ -87,6 +87,17 @@ def test_bodies_of_one_name_in_two_folders_are_two(source: Path, tmp_path: Path)
     [
         ("version: 1\nrecordingz: []\n", "unknown key 'recordingz'"),
         ("version: 1\ndiagnose: {max_effects: 99}\n", "diagnose.max_effects"),
+        ("version: 1\nrun: {at_frames: 3.5}\n", ":2: run.at_frames: input should be a valid boolean"),
+        ("version: 1\n\nrecordings:\n- {rig: a}\n", ":4: recordings.0: key 'experiment' is missing; add it"),
+        ("recordings:\n- {experiment: phantom-00, rig: 1}\n", ":2: recordings.0.rig: should be a text, but it is 1"),
+        ("recordings:\n- {experiment: phantom-00, bags: a}\n", "bags: should be a list, but it is 'a'"),
+        ("- phantom-00\n", "campaign.yaml: is not a mapping of keys"),
+        ("version: 99\n", ":1: version: input should be 1, but it is 99"),
+        ("diagnose: {max_effects: true}\n", "diagnose.max_effects: 'true' is not a number"),
+        ("diagnose: {candidates: [stifness]}\n", "unknown effect 'stifness'; did you mean 'stiffness'"),
+        ("recordings:\n- {experiment: phantom-00}\n- {experiment: phantom-1}\n", "there is no experiment 'phantom-1'"),
+        ("recordings:\n- {experiment: phantom-00}\n- {experiment: 'fantom*'}\n", "there is no experiment 'fantom*'"),
+        ("recordings:\n- {experiment: phantom-00, bags: ['x*']}\n", "'phantom-00' has no recording x*"),
         ("version: [\n", "not valid YAML"),
         ("version: 1\ndiagnose: {}\ndiagnose: {max_effects: 1}\n", ":3: key 'diagnose' is there twice"),
         ("version: 01\ndiagnose: {max_effects: 010}\n", ":2: 010 begins with a zero"),
@@ -97,6 +108,69 @@ def test_a_mistake_in_the_file_is_one_line(source: Path, tmp_path: Path, text: s
     with pytest.raises(InputError, match=r"campaign\.yaml") as error:
         read_plan(source, tmp_path / "out")
     assert said in str(error.value)
+
+
+def test_what_is_no_text_is_one_line(source: Path, tmp_path: Path) -> None:
+    """The name of a bag in place of the file's was a traceback."""
+    with pytest.raises(InputError, match="is no text that can be read"):
+        read_plan(source / "phantom-00" / "take-00.mcap", tmp_path / "out")
+
+
+@pytest.mark.parametrize("name", ["gel [2]", "a*b", "what?", "Gel\u00e4 <b>&", "\u51dd\u80f6"])
+@pytest.mark.parametrize("file", ["", "recordings:\n- {experiment: '%s'}\n- {experiment: 'phantom-*'}\n"])
+def test_names_with_signs_of_patterns_are_names(source: Path, tmp_path: Path, name: str, file: str) -> None:
+    """Recordings of a folder "gel [2]" were left out without a word."""
+    (source / "phantom-01").rename(source / name)
+    (source / "campaign.yaml").write_text(file % name if file else lab.ONLY_READ)
+    names = {r.name for r in read_plan(source, tmp_path / "out")[1]}
+    assert names == {f"{home}/take-0{k}" for home in (name, "phantom-00") for k in (0, 1)}
+
+
+def test_a_pattern_may_begin_at_the_root_and_fits_no_results(source: Path, tmp_path: Path) -> None:
+    """The first was a traceback; and a run's folder beside its experiment was a recording of its own."""
+    run = lab.write_phantom(source / "phantom-00-run")
+    lab.write_take(run / "run.mcap", 7)
+    (run / "metrics.json").write_text("{}")
+    lab.write_take(lab.write_phantom(source / "phantom-out" / "x") / "y.mcap", 8)
+    (source / "campaign.yaml").write_text(f"recordings:\n- {{experiment: '{source}/phantom-*/**/'}}\n")
+    found = read_plan(source, source / "phantom-out")[1]
+    assert [r.name for r in found] == [f"phantom-0{i}/take-0{k}" for i in (0, 1) for k in (0, 1)]
+
+
+def test_experiments_behind_links_are_found_and_links_that_lead_back_are_no_others(
+    source: Path, tmp_path: Path
+) -> None:
+    """A folder with links to the data, as a data store has it, had no recordings."""
+    (source / "phantom-01").rename(tmp_path / "stored")
+    (source / "phantom-01").symlink_to(tmp_path / "stored")
+    (source / "phantom-00" / "up").symlink_to(source)
+    names = [r.name for r in read_plan(source, tmp_path / "out")[1]]
+    assert names == [*(f"../stored/take-0{k}" for k in (0, 1)), *(f"phantom-00/take-0{k}" for k in (0, 1))]
+
+
+def test_an_experiment_within_another_is_no_bag_of_that(source: Path, tmp_path: Path) -> None:
+    """Its folder, which holds bags, was run with the outer experiment."""
+    lab.write_phantom(tmp_path / "outer")
+    for path in (tmp_path / "outer").iterdir():
+        path.rename(source / path.name)
+    assert {r.experiment for r in read_plan(source, tmp_path / "out")[1]} == {source / f"phantom-0{i}" for i in (0, 1)}
+
+
+def test_namesakes_have_names_of_their_own(source: Path, tmp_path: Path) -> None:
+    """A third recording that is called as the number would make it: two rows had one name, and one's problem."""
+    home = source / "phantom-00"
+    (home / "bags").mkdir()
+    lab.write_take(home / "take-00~2.mcap", 8)
+    lab.write_take(home / "bags" / "take-00.mcap", 9)
+    names = [r.name for r in read_plan(source, tmp_path / "out")[1] if r.phantom == "phantom-00"]
+    assert names == [f"phantom-00/take-0{k}" for k in ("0", "0~2", "0~3", "1")]
+
+
+def test_a_name_that_is_no_text_is_one_line(source: Path, tmp_path: Path) -> None:
+    """Of a disk with another encoding: no table or page can hold it, and it was a traceback after all was done."""
+    os.rename(os.fsencode(source / "phantom-00" / "take-00.mcap"), os.fsencode(source / "phantom-00") + b"/t\xe9.mcap")
+    with pytest.raises(InputError, match="its name is not UTF-8"):
+        read_plan(source, tmp_path / "out")
 
 
 def test_a_folder_without_recordings_is_refused(tmp_path: Path) -> None:
@@ -123,6 +197,18 @@ def test_a_key_follows_the_content_and_nothing_else(
     assert [a == b for a, b in zip(changed, keys, strict=True)] == [False, True, False, False]
     monkeypatch.setattr(jobs_module, "versions", lambda: {"livedeform": "another"})
     assert not set(changed) & {j.key for j in planned(source, tmp_path / "out")}
+
+
+def test_the_name_of_a_bags_folder_is_in_its_key(source: Path, tmp_path: Path) -> None:
+    """An experiment says by that name what acts in it: renamed to what it says something of, the old row was shown."""
+    home = source / "phantom-00"
+    (home / "slow").mkdir()
+    (home / "take-00.mcap").rename(home / "slow" / "x.mcap")
+    before = {j.recording.name: j.key for j in planned(source, tmp_path / "out")}
+    (home / "slow").rename(home / "fast")
+    after = {j.recording.name: j.key for j in planned(source, tmp_path / "out")}
+    assert after["phantom-00/fast"] != before["phantom-00/slow"]
+    assert after["phantom-00/take-01"] == before["phantom-00/take-01"]
 
 
 def test_what_cannot_be_read_has_its_line_and_the_rest_goes_on(source: Path, tmp_path: Path) -> None:

@@ -102,6 +102,33 @@ def test_the_page_fetches_nothing_and_no_text_ends_its_script(tmp_path: Path) ->
     assert not re.search(r"(src|href)=[\"']?(https?:)?//", html)
 
 
+def shown(rows: list[Row], out: Path) -> list[dict[str, Any]]:
+    """The cells of the page's rows by name, as its script reads them."""
+    html = write_campaign_page(rows, [], out, "lab").read_text()
+    found = re.search(r'id="campaign-data">(.*?)</script>', html, re.S)
+    assert found is not None and "<" not in found[1]
+    data = json.loads(found[1], parse_constant=lambda constant: pytest.fail(f"{constant} is no JSON"))
+    return [dict(zip((c["name"] for c in data["columns"]), row, strict=False)) for row in data["rows"]]
+
+
+@pytest.mark.parametrize("name", ["<!--<script>", "</script>", "<b>&amp;", "Gel\u00e4 \u51dd\u80f6", "a\u2028b"])
+def test_no_name_is_markup(tmp_path: Path, name: str) -> None:
+    """After "<!--<script>" in a name the rest of the page was text of its script."""
+    rows = [*synthetic_rows(2)]
+    rows[0]["recording"] = rows[0]["effects"] = name
+    assert [row["recording"] for row in shown(rows, tmp_path)] == [name, rows[1]["recording"]]
+
+
+def test_the_page_shows_the_tables_numbers(tmp_path: Path) -> None:
+    """Rounded once: 0.12349 mm was 0.124; and 999 of 1000 frames are not 100 %. What is no number stays empty."""
+    rows = [*synthetic_rows(2)]
+    rows[0] |= {"rmse_m": 0.12349e-3, "coverage": 0.9996, "noise_floor_m": -1e-12}
+    rows[1] |= {"rmse_m": float("nan"), "coverage": 1.0, "noise_floor_m": float("inf")}
+    first, second = shown(rows, tmp_path)
+    assert f"{first['rmse_m']:.3f}" == "0.123" and first["coverage"] == 99.9 and str(first["noise_floor_m"]) == "0.0"
+    assert second["rmse_m"] == second["noise_floor_m"] == "" and second["coverage"] == 100.0
+
+
 SCRIPT = """
 <script>
 const result = {}, list = document.getElementById("rows"), wait = () => new Promise(done => setTimeout(done, 50));

@@ -10,6 +10,7 @@ from livedeform.compare_node.metrics import (
     PooledErrors,
     block_bootstrap,
     correlation_frames,
+    difference_of_rms,
     frame_metrics,
     p95,
     rmse,
@@ -118,3 +119,18 @@ def test_intervals_of_the_rmse_cover_the_truth():
         s = run_metrics(correlated(400, 4, 0.8, rng), 5e-3).rmse
         hits += s.low <= truth <= s.high
     assert 0.85 <= hits / 200 <= 0.99
+
+
+@pytest.mark.parametrize("block", [1, 7, 40])
+def test_the_difference_of_two_rms_errors_has_the_intervals_of_the_bootstrap(block: int) -> None:
+    rng = np.random.default_rng(3)
+    by_frame = [rng.normal(0.0, 1e-3, (rng.integers(1, 6), 2)) ** 2 for _ in range(60)]
+
+    def rise(pairs: np.ndarray) -> float:
+        return rmse(pairs[:, 1]) - rmse(pairs[:, 0])
+
+    (theirs,) = block_bootstrap(by_frame, [rise], block)
+    squares = np.array([(x**2).sum(axis=0) for x in by_frame])
+    mine = difference_of_rms(squares, np.array([len(x) for x in by_frame]), block)
+    for key in ("value", "low", "high"):
+        assert getattr(mine, key) == pytest.approx(getattr(theirs, key), rel=1e-9, nan_ok=True)

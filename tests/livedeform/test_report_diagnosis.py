@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import page_data
+import pytest
 
 from livedeform.common.effect import EffectInfo, Parameter
 from livedeform.report.diagnosis.evidence import Compared, DiagnosisEvidence, FitRow, RestingBody
@@ -76,3 +77,41 @@ def test_verdicts() -> None:
     tied = diagnosis()
     tied["candidates"][0]["indistinguishable_from"] = ["density"]
     assert diagnosis_verdict(tied).said == "Traced to stiffness, or to density"
+
+
+@pytest.mark.parametrize(
+    ("value", "sigma", "interval", "said", "ends"),
+    [
+        (1.00234, 4e-5, (1.00226, 1.00242), "1.00234 ± 4e-05", "1.00226 … 1.00242"),
+        (1234.56, 0.01, (1234.54, 1234.58), "1234.56 ± 0.01", "1234.54 … 1234.58"),
+        (1.31, 0.02, (1.27, 1.35), "1.31 ± 0.02", "1.27 … 1.35"),
+        (-1e-5, 0.3, (-0.6, 0.6), "-1e-05 ± 0.3", "-0.6 … 0.6"),
+        (2.0, 0.0, (2.0, 2.0), "2</code>", "2 … 2"),
+    ],
+)
+def test_a_value_has_the_digits_that_its_sigma_tells(
+    tmp_path: Path, value: float, sigma: float, interval: tuple[float, float], said: str, ends: str
+) -> None:
+    """A scale of 1.00234 +- 0.00004 was "1.002 ± 4e-05", within "1.002 … 1.002"."""
+    effects = [{"name": "stiffness", "parameters": {"ratio": {"value": value, "sigma": sigma}}}]
+    rows = [FitRow("stiffness.ratio", "-", value, sigma, 1.0, 0.2, 5.0, False, interval)]
+    evidence = dataclasses.replace(page_evidence(), fit=rows)
+    text = write_diagnosis_report(tmp_path, diagnosis(effects=effects), evidence).read_text()
+    assert f"ratio = {said}" in text and ends in text and "± 0<" not in text
+
+
+@pytest.mark.parametrize(
+    ("after", "interval", "said"),
+    [
+        (0.0002, [0.79, 0.83], "(82 % less; 95 % interval, these recordings: 79 to 83 % less)"),
+        (0.00132, [-0.3, -0.1], "(20 % more; 95 % interval, these recordings: 30 to 10 % more)"),
+        (0.0002, [None, None], "(82 % less; these recordings do not tell between which ends)"),
+    ],
+)
+def test_the_change_of_the_error_has_one_sign_and_no_nan(
+    tmp_path: Path, after: float, interval: list[float | None], said: str
+) -> None:
+    """An error that rose was "−-20 %", and an interval that there is not "nan to nan %"."""
+    found = diagnosis(improvement_interval=interval)
+    found["error_after"] = found["error_after"] | {"rmse": after}
+    assert said in write_diagnosis_report(tmp_path, found, page_evidence()).read_text()

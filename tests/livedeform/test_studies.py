@@ -231,6 +231,33 @@ def test_booklet_names_what_is_missing(tmp_path: Path, monkeypatch: pytest.Monke
     assert document["studies"]["absent"]["missing"]
 
 
+def test_a_fault_in_one_study_of_all_takes_nothing_from_the_others(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    """A study that failed to converge was missing from the booklet with exit code 0, and a fault left no booklet."""
+
+    def good(out: Path, data: Path | None, progress: object) -> dict:
+        page = StudyPage("good", "Good", "?", out)
+        page.claim("it is", "1", "2", HOLDS)
+        return page.finish()
+
+    def faulty(out: Path, data: Path | None, progress: object) -> dict:
+        raise np.linalg.LinAlgError("Singular matrix")
+
+    def absent(out: Path, data: Path | None, progress: object) -> dict:
+        raise InputError("this study needs data", remedy="get it")
+
+    for studies, code in (({"faulty": faulty, "good": good}, 2), ({"absent": absent, "good": good}, 0)):
+        out = tmp_path / str(code)
+        monkeypatch.setattr(booklet, "STUDIES", studies)
+        assert cli.run(["study", "all", "--out", str(out)]) == code
+        said = capsys.readouterr().err
+        assert ("faulty: a fault of livedeform, LinAlgError: Singular matrix" in said) == (code == 2)
+        assert ("study absent is left out: this study needs data; get it" in said) == (code == 0)
+        assert json.loads((out / "study.json").read_text())["studies"]["good"]["claims"]
+        assert 'href="good/index.html"' in (out / "index.html").read_text()
+
+
 def test_what_was_done_is_kept_when_a_part_fails(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:

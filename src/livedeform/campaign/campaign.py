@@ -7,15 +7,18 @@ import json
 import os
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
+
+import pyarrow as pa
 
 from livedeform import outputs
 from livedeform.campaign.engine import perform_all, workers
-from livedeform.campaign.jobs import Job, jobs_of
+from livedeform.campaign.jobs import ROW, Job, jobs_of
 from livedeform.campaign.page import write_campaign_page
 from livedeform.campaign.plan import Cluster, read_plan
 from livedeform.campaign.pooling import pool_jobs
+from livedeform.campaign.row import read_row
 from livedeform.campaign.table import read_table, rows_of, write_table
 from livedeform.common.errors import InputError, LivedeformError
 
@@ -35,12 +38,14 @@ class CampaignOptions:
 
 @dataclass(frozen=True)
 class CampaignResult:
-    """The numbers of recordings, of those that were done before and now, and the lines of those that failed."""
+    """The numbers of recordings, of those that were done before and now, the lines of those that failed, and those of
+    what was left out of the pooled fit, by recording."""
 
     n: int
     n_before: int
     n_now: int
     problems: dict[str, str]
+    left_out: dict[str, str] = field(default_factory=dict)
 
 
 def run_campaign(options: CampaignOptions, tell: Tell) -> CampaignResult:
@@ -54,6 +59,7 @@ def run_campaign(options: CampaignOptions, tell: Tell) -> CampaignResult:
         outputs.write_configuration(out, outputs.configuration("campaign", about))
         tell(f"reading {len(recordings)} recordings", None)
         jobs = list(jobs_of(recordings, settings, out))
+        _forget_torn_rows(jobs, tell)
         n_before = sum(job.is_done for job in jobs)
         failed, todo = _to_do(jobs, retry=options.retry)
         if n_before:
@@ -61,15 +67,31 @@ def run_campaign(options: CampaignOptions, tell: Tell) -> CampaignResult:
         failed |= _perform(todo, options.cores, settings.cluster, out, tell)
         problems = {job.recording.name: failed[job] for job in jobs if job in failed}
         tell("writing the table and the page", None)
-        write_results(jobs, problems, out, title=options.source.resolve().stem)
+        left_out = write_results(jobs, problems, out, title=_title(options.source.resolve()))
     n_now = len(jobs) - len(problems) - n_before
-    return CampaignResult(len(jobs), n_before, n_now, problems)
+    return CampaignResult(len(jobs), n_before, n_now, problems, left_out)
 
 
-def write_results(jobs: Sequence[Job], problems: dict[str, str], out: Path, *, title: str) -> None:
-    """Write the table, what the recordings have in common, and the page."""
+def write_results(jobs: Sequence[Job], problems: dict[str, str], out: Path, *, title: str) -> dict[str, str]:
+    """Write the table, what the recordings have in common, and the page; return what was left out of the pooled fit."""
     write_table(rows_of(jobs, problems), out)
-    write_campaign_page(read_table(out), pool_jobs(jobs, out), out, title)
+    pooled = pool_jobs(jobs, out)
+    write_campaign_page(read_table(out), pooled.shared, out, title, left_out=pooled.left_out)
+    return pooled.left_out
+
+
+def _title(source: Path) -> str:
+    return source.name if source.is_dir() else source.stem
+
+
+def _forget_torn_rows(jobs: Sequence[Job], tell: Tell) -> None:
+    """Delete rows that cannot be read, as a disk's fault leaves them, so that their jobs are done again."""
+    for job in {job.folder: job for job in jobs if job.is_done}.values():
+        try:
+            read_row(job.folder / ROW)
+        except (OSError, IndexError, pa.ArrowException) as error:
+            tell(f"{job.recording.name} is done again: its row cannot be read ({' '.join(str(error).split())})", None)
+            (job.folder / ROW).unlink(missing_ok=True)
 
 
 def _to_do(jobs: Sequence[Job], *, retry: bool) -> tuple[dict[Job, str], list[Job]]:

@@ -116,8 +116,10 @@ def _content(path: Path, digests: Digests) -> list[list[str]]:
 
 
 def _bag(path: Path, digests: Digests) -> list[list[str]]:
-    """Return what a bag is made of: one file, or those of its folder."""
+    """Return what a bag is made of: one file, or those of its folder, with the name by which an experiment says what
+    acts in it."""
     files = [path] if path.is_file() else sorted(p for p in path.glob("*") if p.is_file())
     if not files:
         raise LivedeformError("the bag does not exist", where=str(path), remedy="name a .mcap file or a rosbag2 folder")
-    return [[file.name, digests(file)] for file in files]
+    folder = [] if path.is_file() else [[path.name, ""]]
+    return folder + [[file.name, digests(file)] for file in files]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
+from math import floor, isfinite
 from pathlib import Path
 from typing import Any
 
@@ -33,12 +34,20 @@ COLUMNS = (
     ("started_ns", "started", "time"),
 )
 VERDICTS = {"effect": "effect named", "none": "no effect", "undecided": "undecided", "unexplained": "unexplained"}
-SCALE = {"mm": 1e3, "percent": 100.0, "time": 1e-9}
-DIGITS = {"mm": 4, "percent": 1, "time": 3}
+SCALE = {"mm": 1e3, "time": 1e-9}
+DIGITS = {"mm": 6, "time": 3}  # more than are shown: nothing is rounded twice
 
 
-def write_campaign_page(rows: Iterable[Row], shared: Sequence[Mapping[str, Any]], out: Path, title: str) -> Path:
-    """Write ``out/index.html``; ``shared``: the causes that recordings have in common, in words."""
+def write_campaign_page(
+    rows: Iterable[Row],
+    shared: Sequence[Mapping[str, Any]],
+    out: Path,
+    title: str,
+    *,
+    left_out: Mapping[str, str] | None = None,
+) -> Path:
+    """Write ``out/index.html``; ``shared``: the causes that recordings have in common, in words, and why recordings are
+    ``left_out`` of that fit."""
     cells: list[str] = []
     count: Counter[str] = Counter()
     for row in rows:
@@ -46,7 +55,7 @@ def write_campaign_page(rows: Iterable[Row], shared: Sequence[Mapping[str, Any]]
         count[f"verdict {row['verdict']}"] += 1
         cells.append(json.dumps(_cells(row), ensure_ascii=False, separators=(",", ":")))
     head = json.dumps([{"name": name, "heading": heading, "kind": kind} for name, heading, kind in COLUMNS])
-    data = f'{{"columns":{head},"rows":[{",".join(cells)}]}}'.replace("</", "<\\/")
+    data = f'{{"columns":{head},"rows":[{",".join(cells)}]}}'.replace("<", "\\u003c")  # no text is markup
     return write_page(
         out / PAGE,
         "campaign.html.j2",
@@ -54,6 +63,7 @@ def write_campaign_page(rows: Iterable[Row], shared: Sequence[Mapping[str, Any]]
         kind="campaign",
         tiles=_tiles(count, len(cells)),
         shared=shared,
+        left_out=left_out or {},
         data=Markup(data),
     )
 
@@ -69,7 +79,11 @@ def _cells(row: Row) -> list[Any]:
 def _cell(value: Any, kind: str) -> Any:
     if value is None or kind == "text":
         return value or ""
-    return round(value * SCALE[kind], DIGITS[kind])
+    if not isfinite(value):  # JSON has no such number
+        return ""
+    if kind == "percent":  # 100 is all of it: what is shown is rounded down
+        return floor(value * 1e3 + 1e-9) / 10
+    return round(value * SCALE[kind], DIGITS[kind]) + 0.0  # no minus before a zero
 
 
 def _tiles(count: Counter[str], n: int) -> list[Tile]:

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import glob
+import itertools
 import os
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
-from pydantic import Field, ValidationError
+import yaml
+from pydantic import BeforeValidator, Field, ValidationError
 
+from livedeform.closed_loop.candidates import check_known
 from livedeform.common.errors import InputError
-from livedeform.common.experiment.schema import Section
+from livedeform.common.experiment.mistakes import IN_WORDS, first_mistake, in_words, locate
+from livedeform.common.experiment.schema import Section, problem
 from livedeform.common.experiment.yaml_file import FILE_NAME
 from livedeform.common.yaml_text import parse_settings
 from livedeform.outputs import CONFIGURATION
@@ -18,6 +23,15 @@ from livedeform.outputs import CONFIGURATION
 CAMPAIGN_FILE = "campaign.yaml"
 BAG_FILES = (".mcap", ".db3")
 RESULT = "metrics.json"  # marks the folder of a run, whose experiment.yaml is a copy
+
+
+def _whole(value: Any) -> Any:
+    if isinstance(value, bool):
+        raise problem(f"{str(value).lower()!r} is not a number", "write a whole number")
+    return value
+
+
+Whole = Annotated[int, BeforeValidator(_whole)]
 
 
 class RecordingsOf(Section):
@@ -37,8 +51,8 @@ class DiagnoseOptions(Section):
     """Say how each recording is diagnosed, as the options of ``livedeform diagnose``."""
 
     candidates: tuple[str, ...] | None = None
-    max_effects: int | None = Field(default=None, ge=0, le=10)
-    seed: int = 0
+    max_effects: Whole | None = Field(default=None, ge=0, le=10)
+    seed: Whole = 0
 
 
 class RunOptionsOfAll(Section):
@@ -52,14 +66,14 @@ class Cluster(Section):
     many ``workers`` of one core, and that class's own ``options`` (queue, memory, walltime ...)."""
 
     kind: str
-    workers: int = Field(1, ge=1)
+    workers: Whole = Field(1, ge=1)
     options: dict[str, Any] = Field(default_factory=dict)
 
 
 class CampaignFile(Section):
     """``campaign.yaml``. ``run`` and ``diagnose`` null leave that step out; ``cluster`` null: processes here."""
 
-    version: int = 1
+    version: Literal[1] = 1
     recordings: tuple[RecordingsOf, ...] = ()
     run: RunOptionsOfAll | None = RunOptionsOfAll()
     diagnose: DiagnoseOptions | None = DiagnoseOptions()
@@ -79,55 +93,115 @@ class CampaignRecording(Section):
 def read_plan(path: Path, out: Path) -> tuple[CampaignFile, list[CampaignRecording]]:
     """Read a folder or a ``campaign.yaml``; recordings are sorted by name. Folders below ``out`` are no input.
 
-    Raises ``InputError`` where the file is wrong or there is no recording at all.
+    Raises ``InputError`` where the file is wrong, names what is not there, or there is no recording at all.
     """
     file = path / CAMPAIGN_FILE if path.is_dir() else path
     if not path.exists():
         raise InputError("does not exist", where=str(path), remedy="name a folder or a campaign.yaml")
     settings = _read_file(file) if file.is_file() else CampaignFile()
-    folder = file.resolve().parent
-    entries = settings.recordings or tuple(_found(folder, out.resolve()))
-    recordings = [r for entry in entries for r in _recordings(entry, folder)]
+    folder, out = file.resolve().parent, out.resolve()
+    recordings = []
+    for number, entry in enumerate(settings.recordings):
+        named = list(_recordings(entry, folder, out))
+        if not named:
+            raise _nothing_named(entry, folder, out, f"{file}: recordings.{number}")
+        recordings += named
+    for entry in () if settings.recordings else _found(folder, out):
+        recordings += _recordings(entry, folder, out)
     if not recordings:
         raise InputError(
             "there is no recording", where=str(path), remedy=f"put bags beside an {FILE_NAME}, or name them in {file}"
         )
+    _refuse_odd_names(recordings)
     return settings, sorted(_told_apart(recordings), key=lambda r: r.name)
 
 
 def _read_file(file: Path) -> CampaignFile:
     try:
-        _, document = parse_settings(file.read_text(encoding="utf-8"), str(file))
-        return CampaignFile.model_validate(document or {})
+        text = file.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        remedy = "name a folder or a campaign.yaml, as plain UTF-8 text"
+        raise InputError("is no text that can be read", where=str(file), remedy=remedy) from error
+    node, document = parse_settings(text, str(file))
+    if document is not None and not isinstance(node, yaml.MappingNode):
+        raise InputError("is not a mapping of keys", where=str(file), remedy="begin with 'version: 1'")
+    try:
+        settings = CampaignFile.model_validate(document or {})
     except ValidationError as error:
-        first = error.errors()[0]
-        key = ".".join(str(part) for part in first["loc"])
-        context = first.get("ctx", {})
-        what = context.get("what") or first["msg"][:1].lower() + first["msg"][1:]
-        raise InputError(
-            what, where=f"{file}: {key}", remedy=context.get("remedy", "docs/campaigns.md has every key")
-        ) from error
+        assert node is not None  # an empty file has no mistake
+        first = first_mistake(error)
+        keys, line = locate(node, first["loc"])
+        what, remedy = in_words(first, "add it; docs/campaigns.md has every key", IN_WORDS)
+        raise InputError(what, where=f"{file}:{line}: {keys}".removesuffix(": "), remedy=remedy) from error
+    if settings.diagnose is not None and settings.diagnose.candidates is not None:
+        try:
+            check_known(settings.diagnose.candidates)
+        except InputError as error:
+            raise InputError(error.what, where=f"{file}: diagnose.candidates", remedy=error.remedy) from error
+    return settings
 
 
 def _found(folder: Path, out: Path) -> Iterator[RecordingsOf]:
-    """Every experiment below ``folder``, but those that are results."""
-    for place, folders, files in os.walk(folder):
-        folders[:] = sorted(f for f in folders if not f.startswith(".") and Path(place, f) != out)
-        if FILE_NAME in files and RESULT not in files and Path(place) != out:
+    """Every experiment below ``folder``, through links too, but those that are results."""
+    known: set[Path] = set()
+    for place, folders, files in os.walk(folder, followlinks=True):
+        here = Path(place).resolve()
+        if here in known or here == out:  # a link that leads back, or the campaign's own folder
+            folders[:] = []
+            continue
+        known.add(here)
+        folders[:] = sorted(f for f in folders if not f.startswith("."))
+        if FILE_NAME in files and RESULT not in files:
             yield RecordingsOf(experiment=str(Path(place).relative_to(folder)))
 
 
-def _recordings(entry: RecordingsOf, folder: Path) -> Iterator[CampaignRecording]:
-    experiments = (
-        sorted(folder.glob(entry.experiment)) if _is_pattern(entry.experiment) else [folder / entry.experiment]
-    )
-    for experiment in experiments:
-        own = experiment.parent if experiment.suffix in (".yaml", ".yml") else experiment
+def _experiments(entry: RecordingsOf, folder: Path, out: Path) -> list[Path]:
+    """Return the experiments that an entry names; of those that a pattern fits not the results. What is there by that
+    name is no pattern."""
+    named = folder / entry.experiment
+    if named.exists() or not _is_pattern(entry.experiment):
+        return [named]
+    found = [path for path in _fitting(entry.experiment, folder) if not (_home(path) / RESULT).is_file()]
+    return [path for path in found if out not in (path.resolve(), *path.resolve().parents)]
+
+
+def _fitting(pattern: str, folder: Path) -> list[Path]:
+    """Return what a pattern fits, as seen from the folder, in the order of names."""
+    return sorted(folder / path for path in glob.glob(pattern, root_dir=folder, recursive=True))
+
+
+def _home(experiment: Path) -> Path:
+    """Return the folder of an experiment that is named by that or by its file."""
+    return experiment.parent if experiment.suffix in (".yaml", ".yml") else experiment
+
+
+def _recordings(entry: RecordingsOf, folder: Path, out: Path) -> Iterator[CampaignRecording]:
+    for experiment in _experiments(entry, folder, out):
+        own = _home(experiment)
         home = own.parent if own.name == "experiment" else own
         phantom = entry.phantom or _label(home, folder)
         for bag in _bags(entry, folder, own, home):
             name = f"{_label(home, folder)}/{bag.stem if bag.is_file() else bag.name}"
             yield CampaignRecording(name=name, experiment=experiment, bag=bag, phantom=phantom, rig=entry.rig)
+
+
+def _nothing_named(entry: RecordingsOf, folder: Path, out: Path, where: str) -> InputError:
+    """Say why an entry of the file has no recordings."""
+    there = [path for path in _experiments(entry, folder, out) if path.exists()]
+    remedy = "paths are relative to the folder of the file; correct it, or take the entry out"
+    if not there:
+        return InputError(f"there is no experiment '{entry.experiment}'", where=where, remedy=remedy)
+    what = f"'{entry.experiment}' has no recording" + (f" {', '.join(entry.bags)}" if entry.bags else "")
+    return InputError(what, where=where, remedy=remedy)
+
+
+def _refuse_odd_names(recordings: Iterable[CampaignRecording]) -> None:
+    """Raise ``InputError`` for a name that is no UTF-8: no table, page or message could hold it."""
+    for r in recordings:
+        for text in (r.name, str(r.bag), str(r.experiment)):
+            if any("\ud800" <= c <= "\udfff" for c in text):
+                shown = text.encode("utf-8", "replace").decode()
+                raise InputError("its name is not UTF-8", where=shown, remedy="rename the file or folder")
 
 
 def _bags(entry: RecordingsOf, folder: Path, own: Path, home: Path) -> list[Path]:
@@ -138,16 +212,18 @@ def _bags(entry: RecordingsOf, folder: Path, own: Path, home: Path) -> list[Path
         return sorted(path for path in found if path not in places and not _is_result(path))
     out: list[Path] = []
     for text in entry.bags:
-        if _is_pattern(text):
-            out += sorted({*folder.glob(text), *own.glob(text)})
+        if _is_pattern(text) and not (own / text).exists() and not (folder / text).exists():
+            out += sorted({*_fitting(text, folder), *_fitting(text, own)})
         else:
             out.append(own / text if (own / text).exists() else folder / text)
     return out
 
 
 def is_bag(path: Path) -> bool:
-    """Tell whether a file or a folder looks like a bag."""
+    """Tell whether a file or a folder looks like a bag; a folder with an experiment has bags of its own."""
     if path.is_dir():
+        if (path / FILE_NAME).is_file():
+            return False
         return (path / "metadata.yaml").is_file() or any(p.suffix in BAG_FILES for p in path.glob("*"))
     return path.suffix in BAG_FILES
 
@@ -169,7 +245,11 @@ def _label(place: Path, folder: Path) -> str:
 
 def _told_apart(recordings: list[CampaignRecording]) -> Iterator[CampaignRecording]:
     """Recordings under names that occur once: what is listed twice is taken once, namesakes are numbered."""
-    seen: dict[str, int] = {}
-    for r in {(r.experiment.resolve(), r.bag.resolve()): r for r in recordings}.values():
-        seen[r.name] = seen.get(r.name, 0) + 1
-        yield r if seen[r.name] == 1 else r.model_copy(update={"name": f"{r.name}~{seen[r.name]}"})
+    different = list({(r.experiment.resolve(), r.bag.resolve()): r for r in recordings}.values())
+    taken, seen = {r.name for r in different}, set[str]()
+    for r in different:
+        free = (f"{r.name}~{n}" for n in itertools.count(2))
+        name = r.name if r.name not in seen else next(n for n in free if n not in taken)
+        taken.add(name)
+        seen.add(name)
+        yield r if name == r.name else r.model_copy(update={"name": name})

@@ -2,13 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from livedeform.campaign.evidence import KeptEvidence, Label, in_common_units, read_evidence
+from livedeform.campaign.evidence import (
+    UNREADABLE,
+    KeptEvidence,
+    KeptShape,
+    Label,
+    effect_of,
+    in_common_units,
+    read_evidence,
+)
 from livedeform.campaign.jobs import Job
 from livedeform.campaign.row import INTERVAL, interval_words
 from livedeform.campaign.shared_causes import Pooled, Scope, Shared, pool
@@ -20,24 +30,45 @@ SHARED = "shared.json"
 KEPT = "diagnosis/linearised.npz"
 
 
-def pool_jobs(jobs: Sequence[Job], out: Path) -> list[dict[str, Any]]:
-    """Fit all recordings that were diagnosed together, write ``out/shared.json`` and return the shared causes."""
-    evidence = in_common_units(_read(jobs))
+@dataclass(frozen=True)
+class PooledCampaign:
+    """The ``shared`` causes as they are written, and why recordings are ``left_out``, by name."""
+
+    shared: list[dict[str, Any]]
+    left_out: dict[str, str]
+
+
+def pool_jobs(jobs: Sequence[Job], out: Path) -> PooledCampaign:
+    """Fit all recordings that were diagnosed together, and write ``out/shared.json``."""
+    kept, left_out = _read(jobs)
+    evidence = in_common_units(kept)
     found = pool(evidence, scopes_of(evidence))
     causes = [document(s, evidence) for s in found.named]
-    write_json(out / SHARED, {"version": 1, "shared": causes, "own": _own(found, evidence)})
-    return causes
+    own = _own(found, evidence)
+    write_json(out / SHARED, {"version": 1, "shared": causes, "own": own, "left_out": left_out})
+    return PooledCampaign(causes, left_out)
 
 
-def _read(jobs: Sequence[Job]) -> Iterator[KeptEvidence]:
-    """Read what is kept of each take once: copies of it, which have one folder, are no further takes."""
+def _read(jobs: Sequence[Job]) -> tuple[list[KeptEvidence], dict[str, str]]:
+    """Read what is kept of each take once: copies of it, which have one folder, are no further takes. Also say of which
+    it cannot be read."""
+    kept: list[KeptEvidence] = []
+    left_out: dict[str, str] = {}
     takes: dict[Path, Job] = {}
     for job in jobs:
         takes.setdefault(job.folder, job)
     for job in takes.values():
         path, recording = job.folder / KEPT, job.recording
-        if job.is_done and path.is_file():
-            yield read_evidence(path, recording.name, recording.phantom, recording.rig)
+        if not job.is_done or not path.is_file():
+            continue
+        try:
+            kept.append(read_evidence(path, recording.name, recording.phantom, recording.rig))
+        except UNREADABLE as error:
+            why = " ".join(str(error).split())
+            left_out[recording.name] = (
+                f"{path}: cannot be read ({why}); delete its folder {job.folder}, and start again"
+            )
+    return kept, left_out
 
 
 def scopes_of(evidence: Sequence[KeptEvidence]) -> list[Scope]:
@@ -46,12 +77,14 @@ def scopes_of(evidence: Sequence[KeptEvidence]) -> list[Scope]:
     rigs = {f"rig {rig}": {e.name for e in evidence if e.rig == rig} for rig in _each(evidence, "rig")}
     phantoms = {f"phantom {p}": {e.name for e in evidence if e.phantom == p} for p in _each(evidence, "phantom")}
     measuring = {name for name, card in all_effects().items() if card.acts_on in ("measuring", "probe")}
-    effects = {effect for e in evidence for effect in e.columns}
     out = []
-    for groups, others, own in ((rigs, phantoms, measuring), (phantoms, rigs, effects - measuring)):
+    for groups, others, is_rigs in ((rigs, phantoms, True), (phantoms, rigs, False)):
         for where, names in groups.items():
-            alone = names in others.values()
-            out.append(Scope(where, frozenset(names), frozenset(effects & own if alone else effects)))
+            count = Counter(effect for e in evidence if e.name in names for effect in e.columns)
+            effects = {effect for effect, n in count.items() if n > 1}
+            if names in others.values():
+                effects = {effect for effect in effects if (effect_of(effect) in measuring) == is_rigs}
+            out.append(Scope(where, frozenset(names), frozenset(effects)))
     return out
 
 
@@ -73,20 +106,33 @@ def document(s: Shared, evidence: Sequence[KeptEvidence]) -> dict[str, Any]:
         }
         for k, label in enumerate(labels)
     ]
+    at = _usual_shape([e.shapes.get(s.effect, ()) for e in evidence if e.name in s.members])
     return {
-        "effect": s.effect,
+        "effect": effect_of(s.effect),
         "scope": s.where,
         "n_members": len(s.members),
         "n_recordings": len(s.scope),
         "members": sorted(s.members),
         "parameters": parameters,
+        "at": at,
         "log_evidence": s.gain,
-        "said": [f"{p['name']} {interval_words(p['value'], *p['interval_95'])}" for p in parameters],
+        "said": [
+            *(f"{p['name']} {interval_words(p['value'], *p['interval_95'])}" for p in parameters),
+            *(f"at {p['name']} {p['value']:.3g}" for p in at),
+        ],
         "scatter_said": [interval_words(p["value"], *p["takes_95"]).partition(" ")[2] for p in parameters],
     }
 
 
-def _name(label: Label) -> str:
+def _usual_shape(shapes: Sequence[Sequence[KeptShape]]) -> list[dict[str, Any]]:
+    """Return what amplitudes are the strength of, in the middle of the recordings that have it."""
+    middle = [(each[0], float(np.median([shape.value for shape in each]))) for each in zip(*shapes, strict=True)]
+    return [{"name": _name(shape), "value": value} for shape, value in middle]
+
+
+def _name(label: Label | KeptShape) -> str:
+    if not label.parameter:  # an effect that is switched as a whole: how much of it there is
+        return "amount"
     return label.parameter if label.index < 0 else f"{label.parameter}[{label.index}]"
 
 
@@ -108,14 +154,15 @@ def _own(found: Pooled, evidence: Sequence[KeptEvidence]) -> Mapping[str, list[d
             for k in x.belongs:
                 s = found.shared[k]
                 rest = rest.given(s.effect, s.value, s.spread)
-            out.setdefault(name, []).append(_told(effect, e.labels[effect], *rest.told_with_prior(effect)))
+            told = _told(effect, e.labels[effect], *rest.told_with_prior(effect))
+            out.setdefault(name, []).append(told | {"at": _usual_shape([e.shapes.get(effect, ())])})
     return out
 
 
 def _told(effect: str, labels: Sequence[Label], values: Array, variances: Array) -> dict[str, Any]:
     """A cause of a recording's own as it is written."""
     return {
-        "effect": effect,
+        "effect": effect_of(effect),
         "parameters": [
             {"name": _name(label), "value": label.value(float(x)), "interval_95": _ends(label, x, float(np.sqrt(v)))}
             for label, x, v in zip(labels, values, variances, strict=True)

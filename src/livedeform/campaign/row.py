@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from itertools import chain
-from math import ceil, log10
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +13,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from livedeform.closed_loop.assessment.verdict import rivals_of
+from livedeform.common.effect import significant
 from livedeform.common.types import Array
 
 LABELS = ("recording", "phantom", "rig", "key")  # of the table, not of the job: a recording may be renamed
@@ -137,6 +137,6 @@ def interval_words(value: float, low: float, high: float) -> str:
     """Say a value and its interval (NaN: none), with so many digits that the interval's width has two."""
     if np.isnan(low) or np.isnan(high):
         return f"{value:.3g}"
-    size, width = max(abs(low), abs(high)), high - low
-    digits = max(3, 2 + ceil(log10(size / width))) if 0.0 < width < np.inf else 3
+    digits = significant(max(abs(low), abs(high)), high - low, 3)
+    value, low, high = value + 0.0, low + 0.0, high + 0.0  # no minus before a zero
     return f"{value:.{digits}g} [{low:.{digits}g}, {high:.{digits}g}]"

@@ -50,6 +50,8 @@ def campaign(
         typer.echo(f"  {name}: {line}")
     if n_failed > SHOWN:
         typer.echo(f"  and {n_failed - SHOWN} more: see the column 'problem' of the table")
+    for name, line in result.left_out.items():
+        typer.echo(f"  {name} is left out of what recordings have in common: {line}")
     typer.echo(f"page: {out / 'index.html'}")
     if n_failed:
         raise typer.Exit(1)

@@ -58,7 +58,9 @@ def _tell(loaded: Sequence[ComparedRun], differences: Sequence[Difference | None
         _print_table(page.AGAINST, [page.against_row(d) for d in differences if d is not None])
     for run, difference in zip(loaded[1:], differences, strict=True):
         if difference is None:
-            typer.echo(f"{run.name} is not paired with {loaded[0].name}: another recording, or no moment in common")
+            typer.echo(
+                f"{run.name} is not paired with {loaded[0].name}: another recording, no marker or no moment in common"
+            )
         else:
             typer.echo(page.sentence(difference, loaded[0].name))
     for name in page.parts_of(loaded):

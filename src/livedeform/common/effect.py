@@ -37,10 +37,12 @@ __all__ = [
     "effects_in",
     "is_filmed",
     "one_start",
+    "significant",
 ]
 
 ActsOn = Literal["body", "support", "load", "probe", "measuring"]
 Scale = Literal["linear", "log", "inverse"]
+MOST_DIGITS = 15  # of a number: a float has no more
 STEP = 0.05  # of a coordinate's prior sigma: its step where the card gives none
 
 
@@ -256,10 +258,20 @@ class EffectInfo:
             np.full(values.shape, np.nan) if sigma is None else np.broadcast_to(np.asarray(sigma, float), values.shape)
         )
         pairs = zip(values.ravel(), sigmas.ravel(), strict=True)
-        parts = [f"{v:.4g} ± {s:.2g}" if np.isfinite(s) else f"{v:.4g}" for v, s in pairs]
+        parts = [
+            f"{v:.{significant(abs(v), s, 4)}g} ± {s:.2g}" if np.isfinite(s) and s > 0.0 else f"{v:.4g}"
+            for v, s in pairs
+        ]
         unit = self.parameter(name).unit
         text = parts[0] if values.ndim == 0 else "(" + ", ".join(parts) + ")"
         return text if unit in ("", "-", "1") else f"{text} {unit}"
+
+
+def significant(size: float, width: float, least: int) -> int:
+    """Return how many significant digits numbers up to ``size`` need, so that what is ``width`` has two of them."""
+    if not 0.0 < width < np.inf or not 0.0 < size < np.inf:
+        return least
+    return int(np.clip(2 + np.ceil(np.log10(size / width)), least, MOST_DIGITS))
 
 
 def effects_in(package: str, path: Iterable[str]) -> dict[str, ModuleType]:

@@ -11,6 +11,7 @@ from livedeform.compare_node.metrics import Level, RunMetrics
 from livedeform.compare_node.surface_error import SurfaceError
 
 ENOUGH, HALF = 0.9, 0.5  # of the measured frames, and of the deepest moments: below it WARN at best, and STALE
+SMALL = 0.0095  # mm, below which two decimals are 0.01 or 0.00
 REFUSED = {
     "extrapolation": "before the first or after the last prediction",
     "gap": "between predictions too far apart",
@@ -164,4 +165,7 @@ def _sentence(*parts: str) -> str:
 
 
 def _mm(value: float) -> str:
-    return f"{value * 1e3:.2f}"
+    """Say a length in mm; one that two decimals would show as next to nothing has two digits."""
+    size = abs(value) * 1e3
+    small = 0.0 < size < SMALL
+    return f"{value * 1e3:.{min(1 - int(np.floor(np.log10(size))), 6)}f}" if small else f"{value * 1e3:.2f}"

@@ -33,6 +33,7 @@ __all__ = [
     "Statistic",
     "block_bootstrap",
     "correlation_frames",
+    "difference_of_rms",
     "frame_metrics",
     "marker_metrics",
     "noise_floor",
@@ -302,6 +303,19 @@ def block_bootstrap(
         for pooled in [np.concatenate([by_frame[f] for f in frames])]
     ]
     return _percentile_intervals(values, samples)
+
+
+def difference_of_rms(squares: Array, counts: np.ndarray, block: int) -> Statistic:
+    """Return the rms of the second errors less that of the first, of frames with sums of squares (m, 2) m2 over
+    ``counts`` (m,) pairs of errors, with the interval of `block_bootstrap`: by how often a resample has each frame."""
+
+    def of(times: np.ndarray) -> float:
+        first, second = np.sqrt(times @ squares / (times @ counts))
+        return float(second - first)
+
+    m = len(counts)
+    samples = [(of(np.bincount(frames, minlength=m)),) for frames in drawn_frames(m, block)]
+    return _percentile_intervals([of(np.ones(m))], samples)[0]
 
 
 def drawn_frames(m: int, block: int, n_resamples: int = N_RESAMPLES) -> Iterator[np.ndarray]:

@@ -11,12 +11,12 @@ import numpy as np
 
 from livedeform.compare_node.metrics import Statistic, rmse
 from livedeform.compare_node.takes import Takes
-from livedeform.comparing.runs import ComparedRun, Difference
+from livedeform.comparing.runs import ComparedRun, Difference, MarkerDifference
 from livedeform.comparing.takes import groups, sharing
 from livedeform.outputs import write_json
 from livedeform.report import plots
 from livedeform.report.page import Chart, Table, Tile, Verdict, write_page
-from livedeform.report.text import MM, interval, mm
+from livedeform.report.text import MM, decimals, interval, mm
 
 COLOURS = (plots.BLUE, plots.ORANGE, plots.GREEN, plots.VERMILLION, plots.SKY, "#CC79A7", plots.GREY)
 HEADER = ("run", "recording", "verdict", "errors", "frames", "rmse (mm)", "95 % interval (mm)", "mean (mm)",
@@ -24,7 +24,7 @@ HEADER = ("run", "recording", "verdict", "errors", "frames", "rmse (mm)", "95 % 
 AGAINST = ("run", "common errors", "common frames", "rmse of the first (mm)", "its own rmse (mm)", "difference (mm)",
            "95 % interval (mm)")  # fmt: skip
 
-
+LEAST_PERCENT = 0.01  # below, a difference is said to be less than that
 TAKES = ("takes", "n", "mean rmse (mm)", "mean of takes, 95 % (mm)", "next take, 95 % (mm)")
 
 
@@ -53,7 +53,7 @@ def write_comparison(out: Path, runs: Sequence[ComparedRun], differences: Sequen
         kind="comparison",
         charts=[chart for chart in (_curves(runs), _bars(runs), _rises(differences)) if chart is not None],
         verdict=verdict_of(runs, differences),
-        tiles=[Tile(run.name, mm(run.metrics.rmse.value, 3), "mm rms", interval(run.metrics.rmse)) for run in runs],
+        tiles=[_tile(run) for run in runs],
         table=Table(HEADER, tuple(tuple(table_row(run)) for run in runs), numbers=tuple(range(3, 10))),
         against=Table(AGAINST, tuple(against_row(d) for d in differences if d), numbers=tuple(range(1, 7))),
         markers=Table(("run", *_marker_header(runs[0])), tuple(_marker_rows(differences)), numbers=tuple(range(1, 7))),
@@ -64,17 +64,35 @@ def write_comparison(out: Path, runs: Sequence[ComparedRun], differences: Sequen
     )
 
 
+def _tile(run: ComparedRun) -> Tile:
+    error = run.metrics.rmse
+    digits = decimals(error.value, least=3)
+    return Tile(run.name, mm(error.value, digits), "mm rms", interval(error, digits))
+
+
 def table_row(run: ComparedRun) -> tuple[str, ...]:
     """A run's numbers, in the order of ``HEADER``."""
     m = run.metrics
-    numbers = (mm(m.rmse.value, 3), _between(m.rmse), mm(m.mean.value, 3), mm(m.p95.value, 3), mm(m.max, 3))
+    digits = decimals(m.rmse.value, m.mean.value, least=3)
+    numbers = (
+        mm(m.rmse.value, digits),
+        _between(m.rmse, digits),
+        *(mm(v, digits) for v in (m.mean.value, m.p95.value, m.max)),
+    )
     return (run.name, Path(run.bag).name, run.verdict, str(m.n), str(m.n_frames), *numbers)
 
 
 def against_row(d: Difference) -> tuple[str, ...]:
     """A difference's numbers, in the order of ``AGAINST``."""
-    numbers = (mm(d.reference, 3), mm(d.other, 3), _signed(d.difference.value), _between(d.difference, signed=True))
-    return (d.name, str(d.n), str(d.n_frames), *numbers)
+    return (d.name, str(d.n), str(d.n_frames), *_numbers_of(d))
+
+
+def _numbers_of(d: Difference | MarkerDifference) -> tuple[str, ...]:
+    """Both rms errors and their difference with its interval, with as many decimals as show it and its sign."""
+    ends = (d.difference.value, d.difference.low, d.difference.high)
+    digits = decimals(*ends, d.difference.high - d.difference.low, least=3)
+    between = _between(d.difference, digits, signed=True)
+    return mm(d.reference, digits), mm(d.other, digits), _signed(d.difference.value, digits), between
 
 
 def takes_of(runs: Sequence[ComparedRun]) -> list[Takes]:
@@ -91,24 +109,33 @@ def parts_of(runs: Sequence[ComparedRun]) -> list[str]:
 def takes_row(takes: Takes) -> tuple[str, ...]:
     """The numbers of takes, in the order of ``TAKES``."""
     e = takes.expected["rmse"]
-    spans = (_between(Statistic(e.value, *span)) for span in (e.mean, e.next))
-    return (", ".join(takes.names), str(e.n), mm(e.value, 3), *spans)
+    digits = decimals(e.value, least=3)
+    spans = (_between(Statistic(e.value, *span), digits) for span in (e.mean, e.next))
+    return (", ".join(takes.names), str(e.n), mm(e.value, digits), *spans)
 
 
 def sentence(d: Difference, reference: str) -> str:
     """Say which of two runs is the better one, or that the data do not tell."""
-    share = 100.0 * abs(d.difference.value) / d.reference if d.reference > 0 else float("nan")
     low, high = d.difference.low, d.difference.high
     if not np.isfinite(low):
         return f"{d.name} and {reference}: too few frames for an interval of their difference"
     if low <= 0.0 <= high:
         return f"{d.name} and {reference} cannot be told apart: their difference may be zero"
     word = "smaller" if high < 0 else "larger"
-    return f"the error of {d.name} is {share:.0f} % {word} than that of {reference}"
+    share = f"{_share(abs(d.difference.value) / d.reference)} " if d.reference > 0.0 else ""
+    return f"the error of {d.name} is {share}{word} than that of {reference}"
+
+
+def _share(share: float) -> str:
+    """Say a share that is not nothing in percent."""
+    percent = 100.0 * share
+    if percent < LEAST_PERCENT:
+        return f"less than {LEAST_PERCENT:g} %"
+    return f"{percent:.0f} %" if percent >= 9.5 else f"{percent:.2g} %"
 
 
 def verdict_of(runs: Sequence[ComparedRun], differences: Sequence[Difference | None]) -> Verdict:
-    """Say what the differences come to; good where one is told from zero."""
+    """Say what the differences come to: good where a run is told to be better than the first, and none to be worse."""
     said = [sentence(d, runs[0].name) for d in differences if d is not None]
     if not said:
         return Verdict(
@@ -117,11 +144,10 @@ def verdict_of(runs: Sequence[ComparedRun], differences: Sequence[Difference | N
             "The runs are of other recordings than the first: only their own numbers are shown.",
         )
     intervals = [d.difference for d in differences if d is not None and np.isfinite(d.difference.low)]
-    told = [i for i in intervals if not i.low <= 0.0 <= i.high]
+    better, worse = any(i.high < 0.0 for i in intervals), any(i.low > 0.0 for i in intervals)
+    tone = "warn" if worse else "good" if better else "neutral"
     because = "; ".join(said)
-    return Verdict(
-        "good" if told else "neutral", because[:1].upper() + because[1:] + ".", "Paired by stamp and marker."
-    )
+    return Verdict(tone, because[:1].upper() + because[1:] + ".", "Paired by stamp and marker.")
 
 
 def _curves(runs: Sequence[ComparedRun]) -> Chart:
@@ -183,22 +209,22 @@ def _marker_header(reference: ComparedRun) -> tuple[str, ...]:
 
 
 def _marker_rows(differences: Sequence[Difference | None]) -> list[tuple[str, ...]]:
-    return [
-        (d.name, str(m.id), str(m.n), mm(m.reference, 3), mm(m.other, 3), _signed(m.difference.value),
-         _between(m.difference, signed=True))
-        for d in differences if d is not None for m in d.markers
-    ]  # fmt: skip
+    return [(d.name, str(m.id), str(m.n), *_numbers_of(m)) for d in differences if d is not None for m in d.markers]
 
 
-def _between(statistic: Statistic, *, signed: bool = False) -> str:
+def _between(statistic: Statistic, digits: int, *, signed: bool = False) -> str:
     if not np.isfinite(statistic.low):
         return "–"
-    say = _signed if signed else lambda value: mm(value, 3)
-    return f"{say(statistic.low)} to {say(statistic.high)}"
+    say = _signed if signed else mm
+    return f"{say(statistic.low, digits)} to {say(statistic.high, digits)}"
 
 
-def _signed(value: float) -> str:
-    return f"{MM * value:+.3f}" if np.isfinite(value) else "–"
+def _signed(value: float, digits: int) -> str:
+    """A difference in millimetres with its sign; that of what is shown as zero would say nothing."""
+    if not np.isfinite(value):
+        return "–"
+    shown = round(MM * value, digits)
+    return f"{shown:+.{digits}f}" if shown else f"{0.0:.{digits}f}"
 
 
 def _write_table(path: Path, header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:

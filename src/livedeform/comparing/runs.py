@@ -6,9 +6,11 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from livedeform.common.bags.read import read_bag
 from livedeform.common.bags.recording import load_recording
 from livedeform.common.errors import InputError
 from livedeform.common.experiment.yaml_file import FILE_NAME, load_experiment
@@ -16,13 +18,14 @@ from livedeform.common.types import Array, Ids
 from livedeform.compare_node.metrics import (
     RunMetrics,
     Statistic,
-    block_bootstrap,
     correlation_frames,
+    difference_of_rms,
     rmse,
     run_metrics,
 )
 from livedeform.compare_node.places import with_places
 from livedeform.compare_node.residual import Residual
+from livedeform.comparing.identity import digest_of, is_part
 from livedeform.comparing.takes import Take, read_take
 from livedeform.outputs import RECORDING
 from livedeform.report.run.read import residuals_of
@@ -33,7 +36,8 @@ FEWEST = 3  # frames of a marker for a difference
 @dataclass(frozen=True)
 class ComparedRun:
     """One run: its ``name`` among the others, the verdict and the recording's name as its own results have them, and
-    its errors; ``take``: what it says as one take of several, None where its results are not beside it."""
+    its errors; ``take``: what it says as one take of several, None where its results are not beside it; ``source``
+    tells its recording from others, empty where that is not known."""
 
     name: str
     path: Path
@@ -43,6 +47,7 @@ class ComparedRun:
     metrics: RunMetrics
     start_ns: int
     take: Take | None = None
+    source: str = ""
 
 
 @dataclass(frozen=True)
@@ -95,21 +100,40 @@ def _load(path: Path, name: str) -> ComparedRun:
     residuals = tuple(r for r in residuals_of(recording) if len(r.ids))
     if not residuals:
         raise InputError("holds no errors of a model", where=str(path), remedy="make it with livedeform run")
-    file = bag.parent / "metrics.json"
-    document = json.loads(file.read_text()) if file.is_file() else {}
+    document = _results(bag.parent / "metrics.json")
     metrics = run_metrics(residuals, float(document.get("threshold") or np.inf))
-    ran = bag.parent / FILE_NAME
-    if ran.is_file():
-        metrics = with_places(metrics, residuals, load_experiment(ran, geometry=False).markers)
+    experiment = bag.parent / FILE_NAME
+    if experiment.is_file():
+        metrics = with_places(metrics, residuals, load_experiment(experiment, geometry=False).markers)
     verdict = str(document.get("verdict", "not judged"))
     take = read_take(path, name) if document else None
-    return ComparedRun(name, path, verdict, str(document.get("bag", "")), residuals, metrics, recording.start_ns, take)
+    source = take.source if take is not None else _source_of(bag)
+    ran = str(document.get("bag", ""))
+    return ComparedRun(name, path, verdict, ran, residuals, metrics, recording.start_ns, take, source)
+
+
+def _results(file: Path) -> dict[str, Any]:
+    """Read what a run says of itself; nothing where that is not beside it, ``InputError`` where it is torn."""
+    if not file.is_file():
+        return {}
+    try:
+        return dict(json.loads(file.read_text()))
+    except (OSError, ValueError, TypeError) as error:
+        remedy = "run it again, or move the file away to compare without it"
+        raise InputError("is not what livedeform run wrote", where=str(file), remedy=remedy) from error
+
+
+def _source_of(bag: Path) -> str:
+    """Return what tells a run's recording from others, as its own recording has it; empty where that is of a part."""
+    with read_bag(bag) as recorded:
+        return "" if is_part(recorded.metadata) else digest_of(recorded)
 
 
 def compared(reference: ComparedRun, other: ComparedRun) -> Difference | None:
     """The difference other - reference over common stamps and markers; None where there are none in common, or where
     they ran other recordings, whose stamps may be alike."""
-    if reference.take is not None and other.take is not None and reference.take.source != other.take.source:
+    sources = [run.source or (run.take.source if run.take is not None else "") for run in (reference, other)]
+    if all(sources) and sources[0] != sources[1]:
         return None
     pairs = _pairs(reference.residuals, other.residuals)
     if not pairs:
@@ -123,7 +147,7 @@ def compared(reference: ComparedRun, other: ComparedRun) -> Difference | None:
         n=len(pooled),
         reference=rmse(pooled[:, 0]),
         other=rmse(pooled[:, 1]),
-        difference=block_bootstrap(by_frame, [_rise], block)[0],
+        difference=difference_of_rms(*_sums(by_frame), block),
         markers=_by_marker(pairs),
     )
 
@@ -142,22 +166,24 @@ def _pairs(reference: Sequence[Residual], other: Sequence[Residual]) -> list[tup
     return pairs
 
 
+def _sums(by_frame: Sequence[Array]) -> tuple[Array, np.ndarray]:
+    """Return each frame's sums of squares (m, 2) m2, and its numbers of errors (m,), of lengths (n, 2) m."""
+    return np.array([(x**2).sum(axis=0) for x in by_frame]), np.array([len(x) for x in by_frame])
+
+
 def _by_marker(pairs: Sequence[tuple[Ids, Array]]) -> tuple[MarkerDifference, ...]:
+    ids, lengths = np.concatenate([ids for ids, _ in pairs]), np.concatenate([lengths for _, lengths in pairs])
+    order = np.argsort(ids, kind="stable")  # the frames of a marker stay in their order
+    markers, first = np.unique(ids[order], return_index=True)
     rows = []
-    for marker in np.unique(np.concatenate([ids for ids, _ in pairs])):
-        track = [lengths[ids == marker] for ids, lengths in pairs if (ids == marker).any()]
+    for marker, track in zip(markers, np.split(lengths[order], first[1:]), strict=True):
         if len(track) < FEWEST:
             continue
-        both = np.concatenate(track)
-        block = _block((both[:, 1] ** 2 - both[:, 0] ** 2).tolist())
-        difference = block_bootstrap(track, [_rise], block)[0]
-        rows.append(MarkerDifference(int(marker), len(both), rmse(both[:, 0]), rmse(both[:, 1]), difference))
+        squares = track**2
+        block = _block((squares[:, 1] - squares[:, 0]).tolist())
+        difference = difference_of_rms(squares, np.ones(len(track)), block)
+        rows.append(MarkerDifference(int(marker), len(track), rmse(track[:, 0]), rmse(track[:, 1]), difference))
     return tuple(rows)
-
-
-def _rise(lengths: Array) -> float:
-    """The rms of the second column less that of the first, m."""
-    return rmse(lengths[:, 1]) - rmse(lengths[:, 0])
 
 
 def _block(series: Sequence[float]) -> int:

@@ -52,11 +52,11 @@ def read_take(path: Path, name: str = "") -> Take:
         bag = str(document["bag"])
         written = folder / CONFIGURATION
         options = json.loads(written.read_text())["options"] if written.is_file() else {}
-    except (OSError, ValueError, KeyError, yaml.YAMLError) as error:
+        markers = {m["id"]: m["rmse"] for m in document["markers"]}
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, yaml.YAMLError) as error:
         raise InputError("is no run", where=str(path), remedy="name the folder that livedeform run wrote") from error
     if not all(isinstance(v, float) and v > 0.0 for v in numbers.values()):
         raise InputError("compared nothing with a model", where=str(path), remedy="name a run that did")
-    markers = {m["id"]: m["rmse"] for m in document["markers"]}
     part = bool(options.get("start") or options.get("duration"))
     whole = (document.get("recording") or {}).get("whole", not part) and not document.get("interrupted", False)
     return Take(

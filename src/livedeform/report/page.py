@@ -102,7 +102,7 @@ class Chart:
     @cached_property
     def json(self) -> Markup:
         """The figure as JSON that cannot end its script element."""
-        return Markup(self.figure.to_json().replace("</", "<\\/"))
+        return Markup(self.figure.to_json().replace("<", "\\u003c"))
 
     @property
     def element(self) -> Markup:

@@ -154,17 +154,27 @@ def figure(playback: Playback, arrows: float = 1.0) -> go.Figure:
         x, y, z = drawn(playback.path[:: max(1, len(playback.path) // 400)])
         line = {"color": SKY, "width": 2}
         first.append(go.Scatter3d(x=x, y=y, z=z, mode="lines", name="path of the probe", line=line, hoverinfo="skip"))
+    names = _names([m.seconds for m in moments])
     frames = [
         go.Frame(
             data=[_places(trace) for trace in (
                 *_surface(playback, m), *_probe(playback, m), *_markers(m, highest, arrows))],
-            traces=moving, name=f"{m.seconds:.2f}",
+            traces=moving, name=name,
         )
-        for m in moments
+        for name, m in zip(names, moments, strict=True)
     ]  # fmt: skip
     shown = go.Figure(data=first, frames=frames)
     shown.update_layout(**_layout(frames))
     return shown
+
+
+def _names(seconds: Sequence[float]) -> list[str]:
+    """Return the names of moments, by which the slider finds them: with as many decimals as tell them apart."""
+    for decimals in range(2, 10):
+        names = [f"{s:.{decimals}f}" for s in seconds]
+        if len(set(names)) == len(names):
+            break
+    return names
 
 
 def _places(trace: go.Mesh3d | go.Scatter3d) -> go.Mesh3d | go.Scatter3d:

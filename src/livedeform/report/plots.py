@@ -21,6 +21,7 @@ BLUE, ORANGE, GREEN, VERMILLION, SKY, GREY = (
 )  # fmt: skip
 SCALE, viridis = "Viridis", colormaps["viridis"]
 MM = 1e3
+FEW_POINTS = 20  # of one line; up to these, each has a mark: a single one has no line
 MAX_POINTS = 3000  # of one line; more are thinned out for the page, never for the numbers
 
 
@@ -60,13 +61,14 @@ def error_over_time(
     """Errors (mm) over the recording's time, the threshold (m), vertical marks; ``second`` is drawn below."""
     figure = go.Figure()
     for line in lines:
-        seconds, values = _thinned(line.seconds, line.values)
+        shown = _shown(line.values)
+        seconds, values = line.seconds[shown], line.values[shown]
         figure.add_scatter(
             x=seconds,
             y=values,
-            customdata=None if line.weights is None else _thinned(line.seconds, line.weights)[1],
+            customdata=None if line.weights is None else line.weights[shown],
             name=line.name,
-            mode="lines",
+            mode=_mode(seconds),
             line={"color": line.colour, "width": 2, "dash": line.dash},
             hovertemplate="%{y:.3f} mm",
         )
@@ -78,9 +80,10 @@ def error_over_time(
     layout["xaxis"] = {"title": "time since the recording's start (s)"}
     layout["yaxis"] = {"title": "error (mm)", "rangemode": "tozero"}
     if second is not None:
-        seconds, values = _thinned(second.seconds, second.values)
+        shown = _shown(second.values)
+        seconds, values = second.seconds[shown], second.values[shown]
         below = {"line": {"color": second.colour, "width": 1.6}, "yaxis": "y2", "hovertemplate": "%{y:.3f}"}
-        figure.add_scatter(x=seconds, y=values, name=second.name, mode="lines", **below)
+        figure.add_scatter(x=seconds, y=values, name=second.name, mode=_mode(seconds), **below)
         layout |= {
             "height": 460,
             "yaxis": layout["yaxis"] | {"domain": [0.36, 1.0]},
@@ -89,6 +92,10 @@ def error_over_time(
         layout["xaxis"] |= {"anchor": "y2"}
     figure.update_layout(**layout)
     return figure
+
+
+def _mode(seconds: Array) -> str:
+    return "lines+markers" if len(seconds) <= FEW_POINTS else "lines"
 
 
 def _add_threshold(figure: go.Figure, lines: Sequence[Line], threshold: float) -> None:
@@ -236,9 +243,16 @@ def _rgb(colour: Array) -> str:
     return "rgb({:.0f},{:.0f},{:.0f})".format(*colour)
 
 
-def _thinned(seconds: Array, values: Array) -> tuple[Array, Array]:
-    step = max(1, -(-len(seconds) // MAX_POINTS))
-    return seconds[::step], values[::step]
+def _shown(values: Array) -> NDArray[np.int64]:
+    """Return the rows of a line that the page has: all of few; else of each stretch the lowest and the highest, so that
+    no peak is left out."""
+    n = len(values)
+    if n <= MAX_POINTS:
+        return np.arange(n)
+    stretches = np.array_split(np.arange(n), MAX_POINTS // 2)
+    low, high = np.nan_to_num(values, nan=np.inf), np.nan_to_num(values, nan=-np.inf)
+    ends = [(rows[np.argmin(low[rows])], rows[np.argmax(high[rows])]) for rows in stretches]
+    return np.unique(ends)
 
 
 def base_layout(height: int) -> dict[str, Any]:

@@ -23,11 +23,17 @@ OF_THIS_RECORDING = "of this recording's mean; the next take differs by what is 
 WITH_PLACES = "; the stated uncertainty of the marker places is in it"
 
 
-def interval(statistic: Statistic) -> str:
+def interval(statistic: Statistic, digits: int = 2) -> str:
     """The 95 % interval of a length in millimetres: of this recording, see `OF_THIS_RECORDING`."""
     if not np.isfinite(statistic.low):
         return "too few frames for an interval"
-    return f"95 % interval, this recording: {mm(statistic.low)} to {mm(statistic.high)}"
+    return f"95 % interval, this recording: {mm(statistic.low, digits)} to {mm(statistic.high, digits)}"
+
+
+def decimals(*values: float, least: int = 2, most: int = 6) -> int:
+    """Return how many decimals (mm) lengths in m need, so that the smallest but zero has two significant ones."""
+    sizes = [abs(v) * MM for v in values if np.isfinite(v) and v != 0.0]
+    return int(np.clip(1 - np.floor(np.log10(min(sizes))), least, most)) if sizes else least
 
 
 def less(share: float) -> str:

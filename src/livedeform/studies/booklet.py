@@ -8,10 +8,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from livedeform.common.errors import LivedeformError
+from livedeform.common.errors import InputError
 from livedeform.report.page import Table, write_page
 from livedeform.studies import STUDIES
-from livedeform.studies.study import TONE, Claim, IncompleteStudyError, Progress
+from livedeform.studies.study import TONE, Claim, IncompleteStudyError, Progress, reason
 
 
 @dataclass(frozen=True)
@@ -34,21 +34,31 @@ class Chapter:
 
 def make_booklet(out: Path, data: Path | None, progress: Progress) -> dict[str, Any]:
     """Run every study into ``out/<name>`` and write the front page and ``study.json``; a study whose data is absent is
-    named with the reason."""
+    named with the reason, and what failed otherwise is in ``failed`` as well."""
     started = time.monotonic()
-    chapters = []
+    chapters: list[Chapter] = []
+    failed: dict[str, str] = {}
     for number, (name, run) in enumerate(STUDIES.items()):
         progress(f"study {name}", number / len(STUDIES))
         try:
             chapters.append(Chapter(name, run(out / name, data, progress)))
         except IncompleteStudyError as error:
             chapters.append(Chapter(name, error.document))
-        except LivedeformError as error:
+            failed[name] = str(error)
+        except InputError as error:
             chapters.append(Chapter(name, {}, str(error)))
+        except OSError:  # a full disk is nothing that the others would be spared
+            raise
+        except Exception as error:  # a fault in one study takes nothing from the others
+            chapters.append(Chapter(name, {}, reason(error)))
+            failed[name] = reason(error)
+        if chapters[-1].missing:
+            progress(f"study {name} is left out: {chapters[-1].missing}", None)
     document = {
         "version": 1,
         "name": "all",
         "studies": {c.name: c.document or {"missing": c.missing} for c in chapters},
+        "failed": failed,
         "seconds": round(time.monotonic() - started, 1),
     }
     out.mkdir(parents=True, exist_ok=True)

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Self
 
 from livedeform import outputs
-from livedeform.common.errors import InputError
+from livedeform.common.errors import InputError, LivedeformError
 from livedeform.progress import Progress
 from livedeform.studies import STUDIES, Study
 from livedeform.studies.study import IncompleteStudyError
@@ -51,7 +51,10 @@ def run_study(
 def _booklet(*arguments: Any) -> dict[str, Any]:
     from livedeform.studies.booklet import make_booklet
 
-    return make_booklet(*arguments)
+    document = make_booklet(*arguments)
+    if failed := document["failed"]:
+        raise IncompleteStudyError(ALL, {name: LivedeformError(line) for name, line in failed.items()}, document)
+    return document
 
 
 class _Stop:

@@ -2,12 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
+import yaml
 from pydantic import ValidationError
 from pydantic_core import ErrorDetails
 
 MOST_SHOWN = 60  # characters of a wrong value
+IN_WORDS = {  # what pydantic's types of mistakes are called, and what helps
+    "model_type": ("should be a mapping", "write keys with their values"),
+    "dict_type": ("should be a mapping", "write keys with their values"),
+    "tuple_type": ("should be a list", "write it in brackets"),
+    "too_short": ("should have an entry", "add one"),
+    "string_type": ("should be a text", "write it in quotation marks"),
+}
 
 
 def first_mistake(error: ValidationError) -> ErrorDetails:
@@ -32,3 +40,23 @@ def in_words(
     shown = repr(mistake["input"])
     shown = shown if len(shown) < MOST_SHOWN else shown[: MOST_SHOWN - 3] + "..."
     return f"{message}, but it is {shown}", remedy
+
+
+def locate(node: yaml.Node, loc: Sequence[int | str]) -> tuple[str, int]:
+    """Return the dotted key and the line of the deepest part of ``loc`` that is in the file."""
+    keys: list[str] = []
+    line = node.start_mark.line + 1
+    for part in loc:
+        child = None
+        if isinstance(node, yaml.MappingNode):
+            for key, value in node.value:
+                if key.value == part:
+                    child, line = value, key.start_mark.line + 1
+        elif isinstance(node, yaml.SequenceNode) and isinstance(part, int) and part < len(node.value):
+            child = node.value[part]
+            line = child.start_mark.line + 1
+        if child is None:
+            break
+        keys.append(str(part))
+        node = child
+    return ".".join(keys), line

@@ -17,7 +17,7 @@ from pydantic import ValidationError
 from livedeform.common.effect import EFFECT_PARAMETERS, EffectInfo
 from livedeform.common.errors import InputError
 from livedeform.common.experiment.markers_file import no_markers, read_markers
-from livedeform.common.experiment.mistakes import first_mistake, in_words
+from livedeform.common.experiment.mistakes import first_mistake, in_words, locate
 from livedeform.common.experiment.plausibility import check_geometry
 from livedeform.common.experiment.schema import (
     Experiment,
@@ -179,7 +179,7 @@ def _explain(error: ValidationError, file: Path, root: yaml.Node) -> InputError:
     A union reports a mistake once per alternative; the deepest report is about the alternative that was meant.
     """
     details = max(error.errors(), key=lambda d: len(d["loc"])) if _same_place(error) else first_mistake(error)
-    keys, line = _locate(root, details["loc"])
+    keys, line = locate(root, details["loc"])
     what, remedy = in_words(details, "add it; docs/experiment.md describes every key")
     where = f"{file}:{line}: {keys}" if keys else f"{file}:{line}"
     return InputError(what, where=where, remedy=remedy)
@@ -188,23 +188,3 @@ def _explain(error: ValidationError, file: Path, root: yaml.Node) -> InputError:
 def _same_place(error: ValidationError) -> bool:
     first = error.errors()[0]["loc"]
     return len(first) > 2 and all(d["loc"][:2] == first[:2] for d in error.errors()) and first[:2] == ("stereo", "pose")
-
-
-def _locate(node: yaml.Node, loc: Sequence[int | str]) -> tuple[str, int]:
-    """The dotted key and the line of the deepest part of ``loc`` that is in the file."""
-    keys: list[str] = []
-    line = node.start_mark.line + 1
-    for part in loc:
-        child = None
-        if isinstance(node, yaml.MappingNode):
-            for key, value in node.value:
-                if key.value == part:
-                    child, line = value, key.start_mark.line + 1
-        elif isinstance(node, yaml.SequenceNode) and isinstance(part, int) and part < len(node.value):
-            child = node.value[part]
-            line = child.start_mark.line + 1
-        if child is None:
-            break
-        keys.append(str(part))
-        node = child
-    return ".".join(keys), line

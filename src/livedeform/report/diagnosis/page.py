@@ -24,7 +24,7 @@ from livedeform.report.diagnosis.tables import (
     rivals_in,
 )
 from livedeform.report.page import Table, Tile, Verdict, write_page
-from livedeform.report.text import MM, less, less_between, mm, words
+from livedeform.report.text import decimals, less, less_between, mm, words
 
 
 def write_report(out: Path, result: Diagnosis, experiment: Experiment) -> Path:
@@ -87,8 +87,7 @@ def diagnosis_verdict(diagnosis: Mapping[str, Any]) -> Verdict:
 
 def _digits(diagnosis: Mapping[str, Any]) -> int:
     """Decimals (mm) that the page's first numbers need, all alike: two significant ones of the smallest, if not two."""
-    smallest = min(diagnosis["error_before"]["rmse"], diagnosis["error_after"]["rmse"], diagnosis["noise_floor"])
-    return 2 if not smallest > 0.0 else int(np.clip(1 - np.floor(np.log10(smallest * MM)), 2, 6))
+    return decimals(diagnosis["error_before"]["rmse"], diagnosis["error_after"]["rmse"], diagnosis["noise_floor"])
 
 
 def _numbers_behind(diagnosis: Mapping[str, Any]) -> str:
@@ -98,10 +97,20 @@ def _numbers_behind(diagnosis: Mapping[str, Any]) -> str:
     noise = f"{mm(floor, digits)} mm"
     if not diagnosis["effects"]:
         return f"Held-out rmse {mm(before, digits)} mm; the measuring noise alone would leave {noise}."
-    low, high = diagnosis.get("improvement_interval") or (float("nan"), float("nan"))
-    gain = f"{less(1.0 - after / before)}; 95 % interval, these recordings: {less_between(low, high)}"
-    errors = f"{mm(before, digits)} mm before, {mm(after, digits)} mm after ({gain})"
+    errors = f"{mm(before, digits)} mm before, {mm(after, digits)} mm after{_gain(diagnosis)}"
     return f"Held-out rmse {errors}; the measuring noise alone leaves {noise}. {next_recording(diagnosis)}"
+
+
+def _gain(diagnosis: Mapping[str, Any]) -> str:
+    """Say by how much the error changed, in brackets, and between which ends its improvement lies."""
+    before, after = diagnosis["error_before"]["rmse"], diagnosis["error_after"]["rmse"]
+    if not before > 0.0 or not np.isfinite(after):
+        return ""
+    change = less(1.0 - after / before)
+    low, high = diagnosis.get("improvement_interval") or (float("nan"), float("nan"))
+    if not np.isfinite([low, high]).all():
+        return f" ({change}; these recordings do not tell between which ends)"
+    return f" ({change}; 95 % interval, these recordings: {less_between(low, high)})"
 
 
 def next_recording(diagnosis: Mapping[str, Any]) -> str:
@@ -110,8 +119,9 @@ def next_recording(diagnosis: Mapping[str, Any]) -> str:
     if not isinstance(found, Mapping):
         return "Another recording: one that was held out does not say how recordings differ."
     (low, high), gain = found["error_after_rmse"], found["improvement"]
+    digits = decimals(low, high)
     return (
-        f"Another recording like these {found['recordings']}: rmse {mm(low)} to {mm(high)} mm, "
+        f"Another recording like these {found['recordings']}: rmse {mm(low, digits)} to {mm(high, digits)} mm, "
         f"{less_between(*gain)} (95 %)."
     )
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from livedeform.closed_loop.assessment.verdict import rivals_of
-from livedeform.common.effect import EffectInfo
+from livedeform.common.effect import EffectInfo, significant
 from livedeform.report.diagnosis.evidence import DiagnosisEvidence, FitRow, NoiseRow
 from livedeform.report.page import Table
 from livedeform.report.text import mm, words
@@ -30,11 +30,12 @@ def fit_table(rows: Sequence[FitRow]) -> Table | None:
         relative = f"{100 * r.sigma / abs(r.value):.1f} %" if r.value and np.isfinite(r.sigma) else "–"
         bound = "at a bound: the interval is not reliable" if r.at_bound else ""
         low, high = r.interval
-        interval = "–" if np.isnan(low + high) else f"{low:.4g} … {high:.4g}"
+        digits = significant(max(abs(low), abs(high)), high - low, 4)
+        interval = "–" if np.isnan(low + high) else f"{low:.{digits}g} … {high:.{digits}g}"
         lines.append(
             (
                 r.name,
-                f"{r.value:.5g}",
+                f"{r.value:.{significant(abs(r.value), r.sigma, 5)}g}",
                 f"{r.sigma:.2g}",
                 relative,
                 interval,

@@ -6,9 +6,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from livedeform.common.types import Array
+from livedeform.common.types import Array, Ids
 from livedeform.compare_node.metrics import frame_metrics
-from livedeform.compare_node.residual import Residual
+from livedeform.compare_node.residual import Residual, tabulate
 from livedeform.report import plots
 from livedeform.report.overlay import Overlay, overlays
 from livedeform.report.page import Chart
@@ -117,7 +117,7 @@ def per_marker_chart(run: RunSummary) -> Chart | None:
     if not markers:
         return None
     ids = np.array([m.id for m in markers], dtype=np.uint32)
-    half = np.array([_half_width(run, int(i)) for i in ids])
+    half = _half_widths(run, ids)
     rms, n = np.array([m.rmse for m in markers]), np.array([m.n for m in markers])
     figure = plots.error_per_marker({"rms error": plots.Bars(ids, rms, half, n)})
     caption = (
@@ -127,16 +127,24 @@ def per_marker_chart(run: RunSummary) -> Chart | None:
     return Chart("per-marker", figure, caption)
 
 
-def _half_width(run: RunSummary, marker: int) -> float:
-    """Half the 95 % interval (m) of a marker's rms error, frames counted by their effective number.
+def _half_widths(run: RunSummary, markers: Ids) -> Array:
+    """Return half the 95 % interval (m,) m of each marker's rms error, frames counted by their effective number; NaN of
+    fewer than two, and of none that errs.
 
     First order from the mean square: sigma(rms) = sigma(d^2) / (2 rms sqrt(n_effective)).
     """
-    squares = np.array([float(q) for r in run.evidence.residuals for q in r.distances[r.ids == marker] ** 2])
-    if len(squares) < 2 or not squares.any():
-        return float("nan")
-    n_effective = max(1.0, run.metrics.n_effective * len(squares) / max(run.metrics.n_frames, 1))
-    return 1.96 * float(squares.std() / (2.0 * np.sqrt(squares.mean() * n_effective)))
+    table = tabulate([r for r in run.evidence.residuals if len(r.ids)])
+    squares, ids = table.distances**2, np.unique(table.ids)
+    row = np.searchsorted(ids, table.ids)
+    n = np.bincount(row, minlength=len(ids))
+    mean = np.bincount(row, squares, len(ids)) / n
+    spread = np.sqrt(np.bincount(row, (squares - mean[row]) ** 2, len(ids)) / n)
+    n_effective = np.maximum(1.0, run.metrics.n_effective * n / max(run.metrics.n_frames, 1))
+    known = (n > 1) & (mean > 0.0)
+    half = np.full(len(ids), np.nan)
+    half[known] = 1.96 * spread[known] / (2.0 * np.sqrt(mean[known] * n_effective[known]))
+    at = dict(zip(ids.tolist(), half.tolist(), strict=True))
+    return np.array([at.get(int(marker), np.nan) for marker in markers])
 
 
 def overlaid_pictures(run: RunSummary, moments: Sequence[NotableMoment]) -> list[tuple[str, list[Overlay]]]:

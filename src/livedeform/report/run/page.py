@@ -25,7 +25,7 @@ from livedeform.report.run.evidence import RunEvidence
 from livedeform.report.run.moments import interesting_moments
 from livedeform.report.run.read import load_evidence
 from livedeform.report.run.summary import RunSummary
-from livedeform.report.text import date, interval, mm
+from livedeform.report.text import date, decimals, interval, mm
 
 N_WORST = 5
 
@@ -87,12 +87,13 @@ def _verdict(run: RunSummary) -> Verdict:
 
 def _tiles(run: RunSummary) -> list[Tile]:
     m = run.metrics
-    floor = f"noise alone: {mm(m.noise_floor)}" if np.isfinite(m.noise_floor) else "no covariances recorded"
+    digits = decimals(m.rmse.value, m.mean.value)
+    floor = f"noise alone: {mm(m.noise_floor, digits)}" if np.isfinite(m.noise_floor) else "no covariances recorded"
     return [
-        Tile("rmse", mm(m.rmse.value), "mm", interval(m.rmse)),
-        Tile("mean error", mm(m.mean.value), "mm", interval(m.mean)),
-        Tile("95th percentile", mm(m.p95.value), "mm", interval(m.p95)),
-        Tile("largest error", mm(m.max), "mm", floor),
+        Tile("rmse", mm(m.rmse.value, digits), "mm", interval(m.rmse, digits)),
+        Tile("mean error", mm(m.mean.value, digits), "mm", interval(m.mean, digits)),
+        Tile("95th percentile", mm(m.p95.value, digits), "mm", interval(m.p95, digits)),
+        Tile("largest error", mm(m.max, digits), "mm", floor),
         Tile("errors", f"{m.n}", "", f"{m.n_frames} frames, worth {m.n_effective:.0f} independent ones"),
         *_coverage_tiles(m),
     ]

@@ -15,6 +15,7 @@ from livedeform.common import topics as t
 from livedeform.common.bags.read import read_bag
 from livedeform.common.bags.recording import Recording, first_stamp_ns, load_recording, to_image
 from livedeform.common.bags.types import RawMessage, decode
+from livedeform.common.errors import InputError
 from livedeform.common.experiment.schema import Experiment
 from livedeform.common.frames import pose_matrix
 from livedeform.common.types import Array, Image
@@ -40,7 +41,7 @@ def load_evidence(run_dir: Path, experiment: Experiment) -> RunEvidence:
     """Everything that the page shows of a run."""
     bag = run_dir / "run.mcap"
     recording = load_recording(bag, experiment)
-    document = json.loads((run_dir / "metrics.json").read_text())
+    document = _read_metrics(run_dir / "metrics.json")
     long, short = _by_length(recording.metadata)
     residuals = residuals_of(recording)
     metrics = replace(
@@ -68,6 +69,15 @@ def load_evidence(run_dir: Path, experiment: Experiment) -> RunEvidence:
         configuration="\n\n".join(long),
         distances=_distances(run_dir / SURFACE_CSV),
     )
+
+
+def _read_metrics(file: Path) -> dict[str, Any]:
+    """Read what a run says of itself; ``InputError`` where that is torn."""
+    try:
+        return dict(json.loads(file.read_text()))
+    except (ValueError, TypeError) as error:
+        remedy = "run it again: its recording alone does not say what was counted"
+        raise InputError("is not what livedeform run wrote", where=str(file), remedy=remedy) from error
 
 
 def _distances(path: Path) -> Mapping[str, Array]:

@@ -8,7 +8,8 @@
   const REPORTS = { run_verdict: [1, "run"], verdict: [2, "diagnosis"] };  // bit of the row's links, and the folder
   const tone = row => row[at.status] === "failed" || row[at.run_verdict] === "ERROR" ? "bad"
     : row[at.verdict] === "none" || (row[at.verdict] === "" && row[at.run_verdict] === "OK") ? "good" : "warn";
-  const time = s => s === "" ? "" : new Date(1000 * s).toISOString().replace("T", " ").slice(0, 19);
+  const EARLIEST = 1e8;  // s, March 1973: a clock that shows less was never set
+  const time = s => s === "" ? "" : s < EARLIEST ? "clock not set" : new Date(1000 * s).toISOString().replace("T", " ").slice(0, 19);
   const make = (tag, name, text = "") => { const e = document.createElement(tag); e.className = name; e.textContent = text; return e; };
 
   // what is shown: row numbers, filtered and sorted
@@ -63,7 +64,7 @@
   }
 
   function cell(row, c, i) {
-    const value = c.kind === "time" ? time(row[i]) : c.kind === "text" || row[i] === "" ? row[i] : row[i].toFixed(c.kind === "mm" ? 3 : 0);
+    const value = c.kind === "time" ? time(row[i]) : c.kind === "text" || row[i] === "" ? row[i] : row[i].toFixed(c.kind === "mm" ? 3 : 1);
     const e = make("span", `cell ${c.kind === "text" || c.kind === "time" ? "" : "number"}`);
     e.style.width = `${width(c)}px`;
     if (TONE[c.name]) {
@@ -117,15 +118,24 @@
     lines.renew(strips.length);
   }
   document.querySelector("#timelines .filler").addEventListener("painted", () => document.querySelectorAll("#timelines canvas").forEach(paintStrip));
+  function mark(g, tone, x, y) {  // told apart without colours
+    g.beginPath();
+    if (tone === "good") g.arc(x, y, 4, 0, 7);
+    else if (tone === "bad") g.rect(x - 4, y - 4, 8, 8);
+    else { g.moveTo(x, y - 5); g.lineTo(x + 5, y + 4); g.lineTo(x - 5, y + 4); }
+    g.fill();
+  }
   function paintStrip(canvas) {
     const w = canvas.width = canvas.clientWidth, h = canvas.height = 42, g = canvas.getContext("2d");
-    const times = canvas.members.map(i => rows[i][at.started_ns]), low = Math.min(...times), span = Math.max(...times) - low || 1;
+    const times = canvas.members.map(i => rows[i][at.started_ns]), low = Math.min(...times), span = Math.max(...times) - low;
+    const spread = low < EARLIEST || span === 0, n = times.length;
+    const along = k => spread ? (k + 0.5) / n : (times[k] - low) / span;
     const error = i => rows[i][at.error_before_m] || rows[i][at.rmse_m] || 0, top = Math.max(...canvas.members.map(error)) || 1;
-    canvas.places = canvas.members.map((i, k) => [10 + (w - 20) * (times[k] - low) / span, h - 6 - (h - 14) * error(i) / top]);
+    canvas.places = canvas.members.map((i, k) => [10 + (w - 20) * along(k), h - 6 - (h - 14) * error(i) / top]);
     canvas.members.forEach((i, k) => {
       const [x, y] = canvas.places[k], after = rows[i][at.error_after_m];
       g.fillStyle = g.strokeStyle = css(`--${tone(rows[i])}`);
-      g.beginPath(); g.arc(x, y, 4, 0, 7); g.fill();
+      mark(g, tone(rows[i]), x, y);
       if (after !== "") { const z = h - 6 - (h - 14) * after / top; g.beginPath(); g.moveTo(x, y); g.lineTo(x, z); g.moveTo(x - 4, z); g.lineTo(x + 4, z); g.stroke(); }
     });
   }

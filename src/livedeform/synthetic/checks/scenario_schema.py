@@ -13,7 +13,7 @@ import numpy as np
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 
 from livedeform.common.errors import InputError
-from livedeform.common.experiment.mistakes import first_mistake, in_words
+from livedeform.common.experiment.mistakes import IN_WORDS, first_mistake, in_words
 from livedeform.common.experiment.schema import (
     Effects,
     Length,
@@ -38,13 +38,6 @@ LONGEST_STEP = 0.1  # m of the path between solved states
 LONGEST_NAME = 200  # bytes of a name of a recording, which is that of a folder
 NOT_IN_NAMES = re.compile(r'[/\\:*?"<>|\x00-\x1f]')
 RIGHT_ANGLE = 90.0
-IN_WORDS = {  # what pydantic says of types of its own, and the remedy
-    "model_type": ("should be a mapping", "write keys with their values"),
-    "dict_type": ("should be a mapping", "write keys with their values"),
-    "tuple_type": ("should be a list", "write it in brackets"),
-    "too_short": ("should have an entry", "add one"),
-    "string_type": ("should be a text", "write it in quotation marks"),
-}
 
 
 def _whole(value: Any) -> Any:
