@@ -155,3 +155,5 @@ def test_how_often_a_clock_was_set_back():
     assert times_set_back(GOOD[:30] + [stamp - S + 7 for stamp in GOOD[30:]]) == 1
     assert times_set_back(GOOD + GOOD) == 0  # a bag that was played twice
     assert times_set_back([GOOD[k] for k in (0, 2, 1, 5, 4, 3, 6)]) == 0
+    for wrong in (0, GOOD[20] - 2 * S, GOOD[20] - 100 * S, GOOD[20] + 100 * S):  # one that is not set, or wrong
+        assert times_set_back([*GOOD[:20], wrong, *GOOD[20:]]) == 0

@@ -87,6 +87,27 @@ def test_a_second_signal_leaves_out_what_waits_and_not_the_results(
     )[0]
 
 
+FULL = "import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (150_000, 150_000)); " + LIVE
+
+
+def test_on_a_full_disk_it_says_where_the_recording_is(experiment: Path, bag: Path, tmp_path: Path):
+    log, out = tmp_path / "live.log", tmp_path / "out"
+    with (
+        process(FULL, "live", str(experiment), "--out", str(out), out=log, ends=(2,)) as child,
+        conversation((t.PROBE_POSE, t.STEREO_MARKERS), tmp_path / "heard.mcap") as talk,
+    ):
+        messages, n = raw_messages(bag), 0
+        while child.poll() is None:
+            lap, i = divmod(n, len(messages))
+            talk.player.play(shifted(messages[i], lap * len(messages) * small.STEP_NS))
+            talk.graph.spin_once(0.01)
+            n += 1
+    last = log.read_text().strip().splitlines()[-1]
+    named = re.search(r"livedeform recover (\S+) --out", last)
+    assert named is not None and "Traceback" not in log.read_text()
+    assert recover(Path(named[1]), tmp_path / "saved.mcap").n_messages > 10
+
+
 def is_on_disk(recording: Path, scratch: Path) -> bool:
     """Tell whether an error could be recovered from a copy of what is on the disk now: it gets there every second, or
     later on a busy machine."""

@@ -113,14 +113,6 @@ class StampClock:
         return step
 
 
-def times_set_back(stamps_ns: Sequence[int]) -> int:
-    """Return how often a clock was set back between stamps in the order in which they came; repeats do not count."""
-    clock = StampClock()
-    for stamp_ns in dict.fromkeys(stamps_ns):
-        clock.take(stamp_ns)
-    return clock.n_set
-
-
 class StampOrder(Generic[Item]):
     """Gives the items of one stream for what cannot go back in time, and should not go ahead of it: a body that ages.
 
@@ -197,3 +189,28 @@ class StampGate(Generic[Item]):
     def _passed(self, stamp_ns: int, interval: int, items: list[Item]) -> list[Item]:
         self._last, self._interval, self._held = stamp_ns, interval, None
         return items
+
+
+class SetBacks:
+    """Counts in ``n`` how often the clock of a stream was set back, as `StampClock` tells behind a `StampGate`: one
+    wrong stamp is not a clock that was set."""
+
+    def __init__(self) -> None:
+        self._gate, self._clock = StampGate[int](), StampClock()
+
+    @property
+    def n(self) -> int:
+        return self._clock.n_set
+
+    def take(self, stamp_ns: int) -> None:
+        """Take the next stamp, in the order in which they came."""
+        for admitted in self._gate.admit(stamp_ns, stamp_ns):
+            self._clock.take(admitted)
+
+
+def times_set_back(stamps_ns: Sequence[int]) -> int:
+    """Return how often a clock was set back between stamps in the order in which they came; repeats do not count."""
+    found = SetBacks()
+    for stamp_ns in dict.fromkeys(stamps_ns):
+        found.take(stamp_ns)
+    return found.n

@@ -17,7 +17,7 @@ from livedeform.common.checks.recorded import check_recording
 from livedeform.common.errors import RecordingError
 from livedeform.common.experiment.schema import Experiment
 from livedeform.common.frames import odd_norms, unit_pose
-from livedeform.common.stamps import StampClock, StampKind
+from livedeform.common.stamps import SetBacks
 from livedeform.common.types import MarkerFrame, Pose
 
 EVERY = 5.0  # s
@@ -34,7 +34,7 @@ class LiveWatch:
         self._poses: list[Pose] = []
         self._faults: Counter[str] = Counter()
         self._frame_ids: dict[str, str] = {}
-        self._clocks: defaultdict[str, StampClock] = defaultdict(StampClock)
+        self._clocks: defaultdict[str, SetBacks] = defaultdict(SetBacks)
         self._every = self._n_poses = 0
         self._looked, self._changed = 0.0, False
         self._said: set[str] = set()
@@ -44,7 +44,7 @@ class LiveWatch:
         raw = RawMessage(topic, type_name, 0, data)
         try:
             if topic in (t.STEREO_MARKERS, t.PROBE_POSE):
-                self._faults["set_back"] += self._clocks[topic].take(header_stamp_ns(raw) or 0) is StampKind.SET
+                self._clocks[topic].take(header_stamp_ns(raw) or 0)
             if topic == t.STEREO_MARKERS and len(self._frames) < MOST_FRAMES:
                 cloud = decode(raw)
                 self._frames.append(unpack_marker_frame(header_stamp_ns(raw) or 0, unpack(cloud)))
@@ -78,9 +78,10 @@ class LiveWatch:
         self._looked, self._changed = time.monotonic(), False
         frames, poses = list(self._frames), list(self._poses)  # more come in, in another thread
         stamps = [*(f.stamp_ns for f in frames), *(p.stamp_ns for p in poses)]
+        faults = dict(self._faults) | {"set_back": sum(clock.n for clock in list(self._clocks.values()))}
         recording = Recording(
             Path(), min(stamps, default=0), max(stamps, default=0), frames, poses, [], {}, {},
-            faults=dict(self._faults), other_frames=dict(self._frame_ids),
+            faults=faults, other_frames=dict(self._frame_ids),
         )  # fmt: skip
         found = [f for f in check_recording(recording, self._experiment) if f.level != "NOTE"]
         new = [f for f in found if not any(word in f.text for word in NOT_YET) and self._key(f) not in self._said]
