@@ -18,7 +18,7 @@ from livedeform.common.bags.types import RawMessage, decode
 from livedeform.common.checks.declared import check_declared
 from livedeform.common.checks.finding import Finding, Severity
 from livedeform.common.checks.protocol import ProtocolStep, protocol
-from livedeform.common.checks.recorded import check_named, check_recording
+from livedeform.common.checks.recorded import check_named, check_recording, other_frame
 from livedeform.common.errors import CalibrationError, InputError, MeshError, RecordingError
 from livedeform.common.experiment.plausibility import TETRAHEDRON_VOLUME, read_body
 from livedeform.common.experiment.schema import Markers
@@ -266,12 +266,9 @@ class _Fit:
                     f"there are no stereo pictures, {t.STEREO_MARKERS} or {t.STEREO_SURFACE}: nothing was measured",
                 )
             )
-        for name in (t.STEREO_MARKERS, t.STEREO_SURFACE, t.PROBE_POSE, t.PROBE_WRENCH):
-            message = self._first(name) if self._has(name) else None
-            frame = message.header.frame_id if message is not None else t.FRAME_PHANTOM
-            if frame not in (t.FRAME_PHANTOM, ""):
-                text = f"{name} is in the frame '{frame}', and taken to be '{t.FRAME_PHANTOM}'"
-                found.append(Finding("WARN", text, "record it in the phantom's frame", doubts=True))
+        surface = self._first(t.STEREO_SURFACE) if self._has(t.STEREO_SURFACE) else None  # others: `check_frames`
+        if surface is not None and surface.header.frame_id not in (t.FRAME_PHANTOM, ""):
+            found.append(other_frame(t.STEREO_SURFACE, surface.header.frame_id))
         return found
 
     def _cameras(self) -> list[Finding]:

@@ -125,7 +125,8 @@ def prepared(
             shutil.rmtree(draft, ignore_errors=True)
         _unmake(made)
         if isinstance(error, OSError) and error.errno in UNWRITABLE:
-            raise unwritable(error, out) from error
+            kept = draft / RECORDING if in_place else None
+            raise unwritable(error, out, kept if kept is not None and kept.exists() else None) from error
         raise
     finally:
         del _FINAL[draft]
@@ -133,12 +134,15 @@ def prepared(
             os.close(lock)
 
 
-def unwritable(error: OSError, out: Path | None = None) -> LivedeformError:
-    """Say what the system says, in words, and of which file; ``error`` is one of `UNWRITABLE`."""
+def unwritable(error: OSError, out: Path | None = None, kept: Path | None = None) -> LivedeformError:
+    """Say what the system says, in words, and of which file; ``error`` is one of `UNWRITABLE`. ``kept``: a recording of
+    what cannot be made a second time, as far as it was written."""
     path = final(Path(os.fsdecode(error.filename))) if isinstance(error.filename, str | bytes) else out
     where = "" if path is None else str(path.with_name(re.sub(r"^\.(.+)\.draft-\d+$", r"\1", path.name)))
     mine = out is not None and where.startswith(str(out))
     remedy = "name another --out" if mine else "see to the disk, or name another place"
+    if kept is not None:
+        remedy = f"make room; what was recorded until then stays: livedeform recover {kept} --out saved.mcap"
     return LivedeformError(
         f"cannot be {'' if mine else 'read or '}written: {UNWRITABLE[error.errno or 0]}", where=where, remedy=remedy
     )

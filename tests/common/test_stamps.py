@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from livedeform.common.stamps import StampClock, StampGate, StampKind, bad_stamps
+from livedeform.common.stamps import StampClock, StampGate, StampKind, StampOrder, bad_stamps, times_set_back
 
 S = 1_000_000_000
 YEAR = 365 * 86_400 * S
@@ -102,3 +102,58 @@ def test_messages_out_of_order_set_no_clock():
     assert steps[3:6] == [StampKind.LATE] * 3
     another = [GOOD[k] - 5 * S * (k % 2) for k in range(60)]  # two publishers in turn
     assert StampKind.SET not in _steps(another)
+
+
+def test_what_a_gate_holds_back_is_not_lost_in_the_end():
+    """A stop two minutes after the others: no later message says that its stamp is right, and none that it is wrong."""
+    gate = StampGate[int]()
+    passed = [x for k, stamp in enumerate([0, S, 120 * S]) for x in gate.admit(stamp, k)]
+    assert passed + gate.end() == [0, 1, 2] and gate.end() == [] and gate.refused == 0
+
+
+AHEAD = {
+    "one ahead": (lambda k: 20 * S * (k == 20), {20}), "five seconds ahead": (lambda k: 5 * S * (k == 20), {20}),
+    "one back": (lambda k: -20 * S * (k == 20), {20}), "set ahead": (lambda k: 20 * S * (k >= 20), set()),
+    "set back": (lambda k: -20 * S * (k >= 20), {20}), "the last one ahead": (lambda k: 20 * S * (k == 39), set()),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("apart", [S // 30, 2 * S])
+@pytest.mark.parametrize("name", AHEAD)
+def test_a_live_stream_goes_neither_back_nor_ahead_of_its_time(name: str, apart: int):
+    jump, lost = AHEAD[name]
+    order, passed = StampOrder[int](), []
+    for k in range(40):
+        passed += order.admit(GOOD[0] + k * apart + jump(k), k, received_ns=7 * S + k * apart)
+    passed += order.end()
+    assert passed == [k for k in range(40) if k not in lost] and order.refused == len(lost)
+
+
+def test_a_pause_holds_nothing_back_and_a_recording_need_not_say_when_messages_came():
+    order = StampOrder[int]()
+    stamps = [0, S, 40 * S, 40 * S + 1, 50 * S]
+    assert [order.admit(stamp, k, stamp + 3 * S) for k, stamp in enumerate(stamps)] == [[0], [1], [2], [3], [4]]
+    order = StampOrder[int]()
+    assert [order.admit(stamp, k) for k, stamp in enumerate(stamps)] == [[0], [1], [2], [3], [4]]
+
+
+def test_a_bag_that_is_played_faster_loses_nothing():
+    """Ten times as fast, poses a second apart: but for one at the start none waits for the next."""
+    order = StampOrder[int]()
+    came = [order.admit(k * S, k, received_ns=k * S // 10) for k in range(9)]
+    assert came == [[0], [], [1, 2], [3], [4], [5], [6], [7], [8]] and order.refused == 0
+
+
+def test_a_bad_stamp_that_is_sent_twice_is_no_proof_of_itself():
+    order = StampOrder[int]()
+    stamps = [0, S // 10, 30 * S, 30 * S, 2 * S // 10]
+    came = [order.admit(stamp, k, received_ns=k * S // 10) for k, stamp in enumerate(stamps)]
+    assert came == [[0], [1], [], [], [4]] and order.refused == 2
+
+
+def test_how_often_a_clock_was_set_back():
+    assert times_set_back(GOOD[:30] + [stamp - S + 7 for stamp in GOOD[30:]]) == 1
+    assert times_set_back(GOOD + GOOD) == 0  # a bag that was played twice
+    assert times_set_back([GOOD[k] for k in (0, 2, 1, 5, 4, 3, 6)]) == 0
+    for wrong in (0, GOOD[20] - 2 * S, GOOD[20] - 100 * S, GOOD[20] + 100 * S):  # one that is not set, or wrong
+        assert times_set_back([*GOOD[:20], wrong, *GOOD[20:]]) == 0

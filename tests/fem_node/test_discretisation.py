@@ -9,7 +9,7 @@ import pytest
 
 from livedeform.common.types import Pose
 from livedeform.fem_node.contact.probe_shapes import Sphere
-from livedeform.fem_node.discretisation import discretisation_error
+from livedeform.fem_node.discretisation import DiscretisationError, discretisation_error
 from livedeform.fem_node.element.element import make_space
 from livedeform.fem_node.mesh.refine import refined
 from livedeform.fem_node.mesh.structured import block_mesh
@@ -80,3 +80,9 @@ def test_the_pose_is_the_probes_own():
     one = discretisation_error(body(mesh, probe=True), Recorded("r", stamps, 0, POSES))
     other = discretisation_error(delayed, Recorded("r", stamps, 0, late))
     assert other.rms == pytest.approx(one.rms, rel=1e-6)
+
+
+@pytest.mark.parametrize(("motion", "said"), [(0.002, "5.0 % of their motion"), (0.0, "they do not move")])
+def test_of_markers_that_do_not_move_no_share_is_said(motion: float, said: str):
+    line = DiscretisationError(1e-4, 2e-4, motion, 0, (10, 80), np.zeros((1, 3))).line()
+    assert said in line and "nan" not in line

@@ -14,7 +14,7 @@ from test_live import pose as pressing
 from livedeform.common.errors import InputError
 from livedeform.common.types import Pose
 from livedeform.fem_node.live.latest_only import MOST_LESSONS, AnswerOrLearn, InTurn, LatestOnly
-from livedeform.fem_node.live.triggers import AtFrames, AtPoses, interpolate, make_requests
+from livedeform.fem_node.live.triggers import AtFrames, AtPoses, WithoutPoses, interpolate, make_requests
 from livedeform.fem_node.physics.record import Prony
 
 MS = 1_000_000
@@ -118,6 +118,40 @@ def test_poses_out_of_order_age_a_body_no_further(order: str):
     assert forces["turned"][1] == pytest.approx(forces["in order"][1])
     relaxed, expected = (forces[name][-1] / forces[name][1] for name in ("turned", "in order"))
     assert relaxed == pytest.approx(expected, rel=0.01) and expected < 0.8  # measured 0.006 and 0.70
+
+
+@pytest.mark.parametrize("ahead", [0.7, 2.0, 20.0])
+def test_a_pose_stamped_ahead_ages_a_body_no_further(ahead: float):
+    """A probe that holds still, with one wrong stamp, live: as much is relaxed afterwards as without it. Predicted at
+    once, one 20 s ahead relaxed a body with tau = 1 s to the end."""
+    last = {}
+    for name, off in (("right", 0.0), ("wrong", ahead)):
+        model, requests, forces = phantom(changes={"prony": Prony((0.5,), (1.0,))}), AtPoses(), []
+        moments = [(0.0, -0.001), *((0.05 + 0.1 * k, 0.002) for k in range(8))]
+        for k, (t, depth) in enumerate(moments):
+            stamped = replace(pressing(depth), stamp_ns=round((10.0 + t + off * (k == 4)) * 1e9))
+            for moment in requests.on_pose(stamped, round((5.0 + t) * 1e9)):
+                forces.append(model.predict(*moment).force[2])
+        assert len(forces) + requests.skipped == len(moments) and requests.skipped == (name == "wrong")
+        last[name] = forces[-1] / forces[1]
+    assert last["wrong"] == pytest.approx(last["right"], rel=0.01) and last["right"] < 0.85
+
+
+@pytest.mark.parametrize("wrong", ["one late", "one ahead"])
+def test_frames_without_a_probe_come_in_the_order_of_their_time(wrong: str):
+    requests, found = WithoutPoses(), []
+    stamps = [k * 50 * MS for k in range(12)]
+    stamps[5] = {"one late": stamps[3] - MS, "one ahead": stamps[5] + 20_000 * MS}[wrong]
+    for k, stamp in enumerate(stamps):
+        for _ in range(2):  # markers and surface points
+            found += [stamp for _, stamp in requests.on_frame(stamp, k * 50 * MS)]
+    assert found == stamps[:5] + stamps[6:] and requests.skipped == 1 and requests.end() == []
+
+
+def test_what_was_held_back_is_predicted_in_the_end():
+    requests = AtPoses()
+    assert [len(requests.on_pose(pose(t), received)) for t, received in ((0, 0), (5000, 10 * MS))] == [1, 0]
+    assert [moment.stamp_ns for moment, _ in requests.end() if moment is not None] == [5000 * MS]
 
 
 def test_every_pose_is_predicted_after_a_clock_was_set():

@@ -7,6 +7,7 @@ import re
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -61,6 +62,50 @@ def test_it_waits_records_and_ends_cleanly(number: int, experiment: Path, bag: P
         assert metrics["recording"] == {"digest": digest_of(recorded), "whole": True}
     assert (out / "report.html").exists()
     assert "Traceback" not in log.read_text()
+
+
+@pytest.mark.parametrize("apart", [0.0, 0.05, 0.5])
+def test_a_second_signal_leaves_out_what_waits_and_not_the_results(
+    apart: float, experiment: Path, bag: Path, tmp_path: Path
+):
+    """Two taps of Ctrl-C, or a service's manager that is in a hurry: what is recorded gets its results."""
+    log, out = tmp_path / "live.log", tmp_path / "out"
+    with (
+        process(LIVE, "live", str(experiment), "--out", str(out), out=log, ends=(0, 1)) as child,
+        conversation((t.PROBE_POSE, t.STEREO_MARKERS), tmp_path / "heard.mcap") as talk,
+    ):
+        stream(talk, raw_messages(bag), log)
+        child.send_signal(signal.SIGINT)
+        time.sleep(apart)
+        child.send_signal(signal.SIGTERM)
+        child.wait(60.0)
+    metrics = json.loads((out / "metrics.json").read_text())
+    recording = load_recording(out / "run.mcap")
+    assert len(recording.errors) == metrics["n_frames"] >= 1, log.read_text()
+    assert (out / "report.html").exists() and "error" not in log.read_text().partition("press Ctrl-C")[2].partition(
+        "verdict"
+    )[0]
+
+
+FULL = "import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (150_000, 150_000)); " + LIVE
+
+
+def test_on_a_full_disk_it_says_where_the_recording_is(experiment: Path, bag: Path, tmp_path: Path):
+    log, out = tmp_path / "live.log", tmp_path / "out"
+    with (
+        process(FULL, "live", str(experiment), "--out", str(out), out=log, ends=(2,)) as child,
+        conversation((t.PROBE_POSE, t.STEREO_MARKERS), tmp_path / "heard.mcap") as talk,
+    ):
+        messages, n = raw_messages(bag), 0
+        while child.poll() is None:
+            lap, i = divmod(n, len(messages))
+            talk.player.play(shifted(messages[i], lap * len(messages) * small.STEP_NS))
+            talk.graph.spin_once(0.01)
+            n += 1
+    last = log.read_text().strip().splitlines()[-1]
+    named = re.search(r"livedeform recover (\S+) --out", last)
+    assert named is not None and "Traceback" not in log.read_text()
+    assert recover(Path(named[1]), tmp_path / "saved.mcap").n_messages > 10
 
 
 def is_on_disk(recording: Path, scratch: Path) -> bool:

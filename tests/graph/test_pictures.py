@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import small
 from small import Filmed
 
 from livedeform.common import topics as t
@@ -14,10 +16,12 @@ from livedeform.common.bags.read import read_bag
 from livedeform.common.bags.recording import load_recording
 from livedeform.common.bags.recording_writer import RecordingWriter
 from livedeform.common.bags.write import BagWriter
+from livedeform.common.errors import InputError
 from livedeform.common.experiment.markers_file import read_markers
 from livedeform.common.experiment.yaml_file import load_experiment
 from livedeform.run import replay
 from livedeform.run.running import RunOptions, run
+from livedeform.stereo_node.correction import parse_pose
 from livedeform.stereo_node.pipeline import StereoTracker
 
 
@@ -67,3 +71,25 @@ def test_raw_pictures_of_a_part_do_not_hide_compressed_ones(n_raw: int, played: 
                     writer.image(image, topic)
     with read_bag(tmp_path / "film.mcap") as read:
         assert set(replay.plan(read, load_experiment(filmed.folder)).topics) == set(played)
+
+
+@pytest.mark.parametrize("n", [1, 6])
+def test_the_last_pair_is_measured(n: int, filmed: Filmed, tmp_path: Path):
+    """Cameras a millisecond apart, and a pause of a minute before the last pair: the next one would tell whether they
+    are of one moment, and none comes."""
+    late = [60_000_000_000 * (k == n - 1) for k in range(n)]
+    poses = [replace(pose, stamp_ns=pose.stamp_ns + by) for pose, by in zip(small.press(6)[:n], late, strict=True)]
+    pairs = [
+        (replace(left, stamp_ns=pose.stamp_ns), replace(right, stamp_ns=pose.stamp_ns + 1_000_000))
+        for pose, (left, right) in zip(poses, filmed.pairs, strict=False)
+    ]
+    bag = small.write_picture_bag(tmp_path / "film.mcap", poses, pairs)
+    run(RunOptions(filmed.folder, bag, tmp_path / "out"), lambda *_: None)
+    document = json.loads((tmp_path / "out" / "metrics.json").read_text())
+    assert document["counts"]["stereo"] == {"pairs": n, "unpaired": 0} and document["n_frames"] == n
+
+
+@pytest.mark.parametrize("pose", ["1 2 3", "one", "0 0 0 0 0 0 0", "0 0 0 0 0 0 1 1"])
+def test_a_camera_pose_that_is_none_is_refused_in_a_line(pose: str):
+    with pytest.raises(InputError, match=r"seven numbers|unit quaternion"):
+        parse_pose(pose)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -11,8 +13,10 @@ from processes import conversation, process, raw_messages
 
 from livedeform.common import topics as t
 from livedeform.common.bags.read import read_bag
+from livedeform.common.bags.write import BagWriter
 from livedeform.common.errors import InputError
 from livedeform.run.playing import PlayOptions, chosen, messages
+from livedeform.run.scene import _written
 
 PLAY = "from livedeform.cli import main; main()"
 
@@ -51,3 +55,28 @@ def test_stamps_of_now(bag: Path):
 def test_a_topic_that_is_not_there_is_named(bag: Path):
     with read_bag(bag) as opened, pytest.raises(InputError, match="there is no /compare/rmse"):
         chosen(opened, ("/compare/rmse",))
+
+
+STAMPS: dict[str, tuple[int, Callable[[int], int]]] = {
+    "the first is not set": (0, lambda stamp_ns: 0),
+    "the first is ahead": (0, lambda stamp_ns: stamp_ns + 94_608_000_000_000_000),
+    "one is the last that there is": (3, lambda stamp_ns: 2**31 * 1_000_000_000 - 5),
+}
+
+
+@pytest.mark.parametrize("name", STAMPS)
+def test_one_wrong_stamp_moves_no_other(name: str, tmp_path: Path):
+    at, change = STAMPS[name]
+    poses = small.press(8)
+    with BagWriter(tmp_path / "x.mcap") as bag:
+        for k, pose in enumerate(poses):
+            stamped = replace(pose, stamp_ns=change(pose.stamp_ns)) if k == at else pose
+            for topic, kind, data in _written(lambda w, stamped=stamped: w.pose(stamped)):
+                bag.write(topic, kind, pose.stamp_ns, data)
+    with read_bag(tmp_path / "x.mcap") as opened:
+        before = time.time_ns()
+        stamps = [small.stamp_of(raw.data) for raw in messages(opened, [t.PROBE_POSE], PlayOptions(now=True))]
+        after = time.time_ns()
+    for k, (stamp, pose) in enumerate(zip(stamps, poses, strict=True)):
+        if k != at:
+            assert before <= stamp - (pose.stamp_ns - poses[0].stamp_ns) <= after

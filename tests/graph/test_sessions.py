@@ -18,9 +18,15 @@ from processes import Conversation, conversation, raw_messages, shifted
 from small import Filmed
 
 from livedeform.common import topics as t
+from livedeform.common.bags.types import RawMessage
 from livedeform.common.experiment.yaml_file import load_experiment
+from livedeform.common.ros.session import ros
 from livedeform.common.types import Pose, Prediction
 from livedeform.fem_node.live.predictor import make_predictor
+from livedeform.fem_node.node import FemNode
+from livedeform.run.graph import Graph, Player
+from livedeform.run.running import isolated
+from livedeform.run.scene import _written
 
 HEIGHTS = (0.0, 0.001, 0.005, 0.02, 0.1, 0.5)  # m above the body
 DEPTH = 0.002
@@ -162,3 +168,26 @@ def test_a_node_that_is_killed_five_times_comes_back(
     record_property("seconds", took)
     print(f"{name}: back after {', '.join(f'{s:.1f}' for s in took[1:])} s of computing")
     assert max(took[1:]) < limit
+
+
+@pytest.mark.parametrize("last", [False, True], ids=["in between", "at the end"])
+def test_a_pose_stamped_ahead_waits_for_the_next_one(last: bool, experiment: Path):
+    """Live: it is left out when the next one is back in line, and predicted in the end if none comes."""
+    poses = small.press(6)
+    poses[-1 if last else 3] = replace(poses[-1 if last else 3], stamp_ns=small.START_NS + 30_000_000_000)
+    with isolated(), ros([], handle_signals=False) as stop:
+        fem = FemNode({"experiment": str(experiment), "best_effort": False})
+        player = Player([t.PROBE_POSE])
+        with Graph([fem, player], stop) as graph:
+            graph.start()
+            for pose in poses:
+                for topic, kind, data in _written(lambda w, pose=pose: w.pose(pose)):
+                    player.play(RawMessage(topic, kind, 0, data))
+                graph.settle()
+                while fem.busy:
+                    graph.spin_once(0.05)
+            waits = fem.counts()
+            graph.finish(60.0)
+            counts = fem.counts()
+    assert (waits["predicted"], waits["skipped"]) == (5, 0 if last else 1)
+    assert (counts["predicted"], counts["skipped"], counts["unfinished"]) == ((6, 0, 0) if last else (5, 1, 0))

@@ -13,7 +13,7 @@ from livedeform.common import topics as t
 from livedeform.common.ros.session import descriptions, ros
 from livedeform.compare_node.node import CompareNode, CompareParameters
 from livedeform.fem_node.node import FemNode
-from livedeform.fem_node.node import Parameters as FemParameters
+from livedeform.fem_node.parameters import Parameters as FemParameters
 from livedeform.run.graph import RecorderNode, message_type
 from livedeform.run.recorder import RunRecorder
 from livedeform.stereo_node.node import StereoNode

@@ -8,17 +8,29 @@ import signal
 import subprocess
 import sys
 import threading
+from collections.abc import Callable
 from dataclasses import replace
+from html import unescape
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import small
 
 from livedeform.cli import run as command_line
+from livedeform.common import topics as t
+from livedeform.common.bags.read import read_bag
 from livedeform.common.bags.recording import load_recording
-from livedeform.common.types import Prediction
-from livedeform.run.running import RunOptions, run
+from livedeform.common.bags.recording_writer import RecordingWriter
+from livedeform.common.bags.types import RawMessage, decode
+from livedeform.common.bags.write import BagWriter
+from livedeform.common.ros.session import ros
+from livedeform.common.types import MarkerFrame, Pose, Prediction
+from livedeform.compare_node.node import CompareNode
+from livedeform.run.graph import Graph, Player
+from livedeform.run.running import RunOptions, isolated, run
+from livedeform.run.scene import _written
 
 CODE = "from livedeform.cli import main; main()"
 YEAR_NS = 365 * 86_400_000_000_000
@@ -167,3 +179,103 @@ def test_replays_in_real_time_hear_only_themselves(experiment: Path, direct: lis
         document = results(tmp_path / bag.stem)
         assert document["coverage"]["frames_measured"] == 12
         assert document["error"]["rmse"] == pytest.approx(factor * float(np.linalg.norm(small.OFFSET)), abs=2e-4)
+
+
+def stop_at(k: int, seconds: float, direct: list[Prediction]) -> tuple[Pose, MarkerFrame]:
+    """The pose and the markers of one moment of the press, ``seconds`` after its start."""
+    stamp_ns = small.START_NS + round(seconds * 1e9)
+    return replace(small.press()[k], stamp_ns=stamp_ns), replace(measured(direct)[k], stamp_ns=stamp_ns)
+
+
+@pytest.mark.parametrize("seconds", [(0.0, 120.0), (0.0, 0.05, 0.1, 90.0), (0.0, 70.0, 140.0)])
+def test_stops_minutes_apart_are_compared_to_the_last(
+    seconds: tuple[float, ...], experiment: Path, direct: list[Prediction], tmp_path: Path
+):
+    """No message comes after the last stop that could show that its stamp is right; nothing says that it is wrong."""
+    poses, frames = zip(*(stop_at(min(2 * k, 5), at, direct) for k, at in enumerate(seconds)), strict=True)
+    bag = small.write_bag(tmp_path / "stops.mcap", poses, frames)
+    run(RunOptions(experiment, bag, tmp_path / "out"), lambda *_: None)
+    coverage = results(tmp_path / "out")["coverage"]
+    assert coverage["frames_compared"] == coverage["frames_measured"] == len(seconds)
+
+
+def set_back(seconds: float) -> Callable[[Pose | MarkerFrame], Pose | MarkerFrame]:
+    middle_ns = small.START_NS + 30 * small.STEP_NS
+    return lambda item: replace(item, stamp_ns=item.stamp_ns - round(seconds * 1e9) * (item.stamp_ns >= middle_ns))
+
+
+DOUBTED: dict[str, tuple[Callable[[Any], Any], str]] = {
+    "sound": (lambda item: item, ""),
+    "angles for a quaternion": (
+        lambda i: replace(i, orientation_xyzw=np.array([np.pi, 0.0, 0.4, 0.0])) if isinstance(i, Pose) else i,
+        "norm is not 1",
+    ),
+    "a clock that was set back": (set_back(0.725), "clocks were set back"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", DOUBTED)
+def test_inputs_that_may_spoil_the_result_keep_it_from_being_sound(
+    name: str, experiment: Path, direct: list[Prediction], tmp_path: Path
+):
+    """Terminal, page and JSON say so: before, all of these were OK."""
+    change, said = DOUBTED[name]
+    poses = small.press(60)
+    frames = [replace(measured(direct)[k // 5], stamp_ns=pose.stamp_ns) for k, pose in enumerate(poses)]
+    with BagWriter(tmp_path / "x.mcap") as bag:
+        writer = RecordingWriter(Arrival(bag))
+        for pose, frame in zip(poses, frames, strict=True):
+            writer.pose(change(pose))
+            writer.marker_frame(change(frame))
+    told: list[str] = []
+    run(RunOptions(experiment, tmp_path / "x.mcap", tmp_path / "out"), lambda text, *_: told.append(text))
+    document = results(tmp_path / "out")
+    assert document["verdict"] == ("WARN" if said else "OK")
+    for text in (" ".join(told), document["reason"], (tmp_path / "out" / "report.html").read_text()):
+        assert not said or said in unescape(text)
+
+
+class Arrival:
+    """A bag whose messages are received one after the other, whatever their stamps are."""
+
+    def __init__(self, bag: BagWriter) -> None:
+        self._bag, self._n = bag, 0
+
+    def write(self, topic: str, type_name: str, log_time_ns: int, data: bytes) -> None:
+        self._n += 1
+        self._bag.write(topic, type_name, small.START_NS + self._n * small.STEP_NS // 2, data)
+
+
+@pytest.mark.parametrize(("threshold", "n_poses"), [(0.005, 12), (0.0005, 12), (0.00129, 12), (0.005, 5), (0.005, 10)])
+def test_the_topic_ends_with_the_level_of_the_run(
+    threshold: float, n_poses: int, direct: list[Prediction], tmp_path: Path
+):
+    """Who watches /compare/metrics is told the run's verdict in the end: it was OK even of a model that fails."""
+    folder = small.write_experiment(tmp_path / "experiment", threshold=threshold)
+    bag = small.write_bag(tmp_path / "x.mcap", small.press()[:n_poses], measured(direct))
+    metrics = run(RunOptions(folder, bag, tmp_path / "out"), lambda *_: None)
+    with read_bag(tmp_path / "out" / "run.mcap") as recorded:
+        last = [decode(raw) for raw in recorded.messages([t.COMPARE_METRICS])][-1].status[0]
+    values = {pair.key: pair.value for pair in last.values}
+    assert values["verdict"] == str(metrics.level) and last.message.startswith("ended")
+    assert last.level == ["OK", "WARN", "ERROR", "STALE"].index(values["verdict"])
+    assert float(values["rmse"]) == pytest.approx(metrics.rmse.value, rel=1e-6) and int(values["n"]) == metrics.n
+    assert float(values["mean"]) == pytest.approx(metrics.mean.value, rel=1e-6)
+    assert float(values["max"]) == pytest.approx(metrics.max, rel=1e-6)
+
+
+def test_a_message_that_a_gate_refuses_is_counted(experiment: Path, direct: list[Prediction], tmp_path: Path):
+    """Live, nobody has seen the recording before: a stamp days ahead costs its frame, and is a reason."""
+    frames = measured(direct)
+    frames[6] = replace(frames[6], stamp_ns=frames[6].stamp_ns + 2 * 86_400_000_000_000)
+    with isolated(), ros([], handle_signals=False) as stop:
+        compare = CompareNode({"experiment": str(experiment), "stale_after": 0.0, "best_effort": False})
+        player = Player([t.STEREO_MARKERS])
+        with Graph([compare, player], stop) as graph:
+            graph.start()
+            for frame in frames:
+                for topic, kind, data in _written(lambda w, frame=frame: w.marker_frame(frame)):
+                    player.play(RawMessage(topic, kind, 0, data))
+                    graph.settle()
+            counts = compare.counts()
+    assert (counts["measured_frames"], counts["refused_out_of_order"]) == (12, 1)

@@ -17,6 +17,7 @@ from livedeform.common.ros.session import RELIABLE, ros
 from livedeform.common.types import Pose, Prediction
 from livedeform.run.graph import Graph
 from livedeform.run.running import isolated
+from livedeform.run.scene import _written
 from livedeform.run.watch import LiveWatch
 
 
@@ -51,11 +52,28 @@ def watched(experiment: Path, folder: Path, direct: list[Prediction], change: Ca
         (lambda p: replace(p, position=1e3 * p.position), "millimetres"),
         (lambda p: replace(p, orientation_xyzw=p.orientation_xyzw[[1, 2, 3, 0]]), "upside down"),
         (lambda p: replace(p, stamp_ns=p.stamp_ns + 3_600_000_000_000), "the clocks differ"),
+        (lambda p: replace(p, orientation_xyzw=2.0 * p.orientation_xyzw), "norm is not 1"),
     ],
-    ids=["sound", "millimetres", "upside down", "another clock"],
+    ids=["sound", "millimetres", "upside down", "another clock", "no unit quaternion"],
 )
 def test_inputs_that_cannot_be_right_are_said_while_they_come(
     change: Callable[[Pose], Pose], said: str, experiment: Path, direct: list[Prediction], tmp_path: Path
 ):
     found = watched(experiment, tmp_path, direct, change)
     assert any(said in text for text in found) if said else not found
+
+
+def test_another_frame_and_a_clock_that_is_set_back_are_said_while_they_come(
+    experiment: Path, direct: list[Prediction]
+):
+    watch, poses = LiveWatch(load_experiment(experiment)), small.press(40)
+    for k, pose in enumerate(poses):
+        frame = replace(small.frame(pose.stamp_ns, direct[0].ids, direct[0].markers))
+        back = 1_000_000_000 * (k >= 25) - 7
+        for topic, kind, data in [
+            *_written(lambda w, frame=frame: w.marker_frame(frame, "tracker")),
+            *_written(lambda w, pose=pose, back=back: w.pose(replace(pose, stamp_ns=pose.stamp_ns - back))),
+        ]:
+            watch.take(topic, kind, data)
+    said = " ".join(finding.text for finding in watch.news())
+    assert "/stereo/markers is in the frame 'tracker'" in said and "clocks were set back" in said

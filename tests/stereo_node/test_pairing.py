@@ -144,3 +144,14 @@ def test_a_stamp_that_jumps_costs_its_own_pair(jump: str, side: str, lost: tuple
     missing = set(numbers) - set(good) - set(lost)
     assert good == sorted(good) and missing <= {100, 101, 102}
     assert len(missing) <= (1 if jump.startswith("one") else 2)  # measured 1 and 2; a clock set by an hour costs none
+
+
+def test_the_first_pair_is_one_if_no_other_picture_comes_for_a_while():
+    pairs = PicturePairs()
+    left, right = (Image(late, np.zeros((1, 1), np.uint8)) for late in (0, 2 * MS))
+    assert pairs.add_left(left) == [] and pairs.lone() == []
+    assert pairs.add_right(right) == []  # another moment's, if the cameras take five hundred a second
+    assert pairs.lone() == [] and pairs.lone() == [(left, right)]
+    assert pairs.lone() == [] and (pairs.n_pairs, pairs.n_unpaired) == (1, 0)
+    a, b = (Image(10_000 * MS + late, np.zeros((1, 1), np.uint8)) for late in (0, 2 * MS))
+    assert pairs.add_left(a) == [] and pairs.add_right(b) == [(a, b)]  # and the next one waits for nothing

@@ -25,7 +25,7 @@ def parameters(
 
     from livedeform.common.ros.session import parameters_yaml
     from livedeform.compare_node.node import CompareParameters
-    from livedeform.fem_node.node import Parameters as FemParameters
+    from livedeform.fem_node.parameters import Parameters as FemParameters
     from livedeform.outputs import refuse_inputs, write_text
     from livedeform.stereo_node.parameters import StereoParameters
 

@@ -30,6 +30,7 @@ __all__ = [
 MAKE_A_FRAME = 3  # points, if they are not in one line
 ON_A_LINE = 0.02  # of the spread along a line, beside it: a turn about it is as uncertain as 50 misfits
 LEAST_NOISE = 1e-7  # m: a tracker may say that it knows a place exactly
+ODD_NORM = 0.01  # by which a quaternion's norm may differ from 1: some robots write three digits
 NO_ROTATION = "a pose is not finite or has the quaternion zero"
 
 
@@ -58,6 +59,12 @@ def unit_poses(stamps_ns: Sequence[int], positions: Array, orientations_xyzw: Ar
     good = np.isfinite(positions).all(axis=1) & np.isfinite(norms) & (norms >= 1e-6)
     rows = zip(stamps_ns, positions, units, good.tolist(), strict=True)
     return [Pose(stamp_ns, position, unit) if is_good else None for stamp_ns, position, unit, is_good in rows]
+
+
+def odd_norms(orientations_xyzw: Array) -> int:
+    """Count quaternions (n, 4) that are a rotation only once they are normalised: angles, or a part is missing."""
+    with np.errstate(all="ignore"):
+        return int((np.abs(np.sqrt((orientations_xyzw**2).sum(axis=1)) - 1.0) > ODD_NORM).sum())
 
 
 def transform(rotation: Array, translation: Array) -> Array:

@@ -113,6 +113,45 @@ class StampClock:
         return step
 
 
+class StampOrder(Generic[Item]):
+    """Gives the items of one stream for what cannot go back in time, and should not go ahead of it: a body that ages.
+
+    An item whose stamp goes back is left out. One whose stamp jumped ahead by over `JUMP_NS` more than time passed
+    until it came (told by when it was ``received_ns``, which a recording need not tell), and by more than a slow
+    stream's interval, is held back until the next one shows which of them is wrong. ``refused`` counts what is left
+    out.
+    """
+
+    def __init__(self) -> None:
+        self.refused = 0
+        self._clock = StampClock()
+        self._held: list[Item] = []  # one at most
+        self._interval_ns = self._received_ns = 0
+
+    def admit(self, stamp_ns: int, item: Item, received_ns: int | None = None) -> list[Item]:
+        """Return the items that can be taken now, in the order of their stamps."""
+        last_ns = self._clock.last_ns
+        if self._held and stamp_ns == last_ns:  # the same again tells nothing
+            self.refused += 1
+            return []
+        kind = self._clock.take(stamp_ns)
+        if kind is StampKind.LATE:
+            self.refused += 1
+            return []
+        step_ns = stamp_ns - last_ns if last_ns is not None and kind is StampKind.NEXT else 0
+        passed_ns = step_ns if received_ns is None else received_ns - self._received_ns
+        ahead = step_ns - passed_ns > JUMP_NS and step_ns > SLOWER * self._interval_ns
+        self._interval_ns, self._received_ns = step_ns, received_ns or 0
+        held, self._held = self._held, [item] if ahead else []
+        self.refused += 0 if kind is StampKind.NEXT else len(held)
+        return [*(held if kind is StampKind.NEXT else []), *([] if ahead else [item])]
+
+    def end(self) -> list[Item]:
+        """Return what is held back, as nothing comes any more that could show it to be wrong."""
+        held, self._held = self._held, []
+        return held
+
+
 class StampGate(Generic[Item]):
     """Lets messages of a live stream through as they come, save those whose stamp is far from the others.
 
@@ -142,6 +181,36 @@ class StampGate(Generic[Item]):
         self._held = stamp_ns, item
         return []
 
+    def end(self) -> list[Item]:
+        """Return the message that is held back, as nothing comes any more that could show its stamp to be wrong."""
+        held, self._held = self._held, None
+        return [] if held is None else [held[1]]
+
     def _passed(self, stamp_ns: int, interval: int, items: list[Item]) -> list[Item]:
         self._last, self._interval, self._held = stamp_ns, interval, None
         return items
+
+
+class SetBacks:
+    """Counts in ``n`` how often the clock of a stream was set back, as `StampClock` tells behind a `StampGate`: one
+    wrong stamp is not a clock that was set."""
+
+    def __init__(self) -> None:
+        self._gate, self._clock = StampGate[int](), StampClock()
+
+    @property
+    def n(self) -> int:
+        return self._clock.n_set
+
+    def take(self, stamp_ns: int) -> None:
+        """Take the next stamp, in the order in which they came."""
+        for admitted in self._gate.admit(stamp_ns, stamp_ns):
+            self._clock.take(admitted)
+
+
+def times_set_back(stamps_ns: Sequence[int]) -> int:
+    """Return how often a clock was set back between stamps in the order in which they came; repeats do not count."""
+    found = SetBacks()
+    for stamp_ns in dict.fromkeys(stamps_ns):
+        found.take(stamp_ns)
+    return found.n

@@ -12,7 +12,7 @@ divided difference with the prediction before t0. Nothing is extrapolated, nothi
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -44,6 +44,16 @@ class Counts:
     predicted_without_measurement: int = 0
     unknown_ids: set[int] = field(default_factory=set)
     never_measured_ids: set[int] = field(default_factory=set)
+
+    def with_jumps(self, n_frames: int, n_predictions: int) -> Counts:
+        """Return the counts with frames and predictions that did not get here, since their stamp was far off."""
+        return replace(
+            self,
+            measured_frames=self.measured_frames + n_frames,
+            predicted_frames=self.predicted_frames + n_predictions,
+            predicted_out_of_order=self.predicted_out_of_order + n_predictions,
+            refused_out_of_order=self.refused_out_of_order + n_frames + n_predictions,
+        )
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain numbers and lists, for files."""

@@ -70,6 +70,13 @@ def judge(metrics: RunMetrics) -> Judgement:
     return Judgement(Level.OK, f"The model is within {limit}", _sentence(*notes))
 
 
+def level_of(errors: Level, n_compared: int, n_measured: int) -> Level:
+    """Return the level of ``errors`` of so many compared frames, as `judge` has it where nothing else is in doubt."""
+    if not n_compared or n_compared < HALF * n_measured:
+        return Level.STALE
+    return Level.WARN if errors is Level.OK and n_compared < ENOUGH * n_measured else errors
+
+
 def _of_surface(metrics: RunMetrics, surface: SurfaceError, limit: str) -> Judgement:
     """Judge by points without ids alone. They can show that a model is wrong; that it is right they cannot, since they
     do not see what slides along the surface."""

@@ -30,6 +30,7 @@ __all__ = [
     "Level",
     "MarkerMetrics",
     "RunMetrics",
+    "RunningTotal",
     "Statistic",
     "block_bootstrap",
     "correlation_frames",
@@ -45,6 +46,7 @@ __all__ = [
 ]
 
 N_RESAMPLES = 400
+RARE = 0.05  # share of the errors: what the 95th percentile leaves out
 SEED = 20210531  # of the bootstrap: two runs must give the same interval
 
 
@@ -199,6 +201,36 @@ def verdict(rmse_m: float, p95_m: float, threshold: float) -> Level:
     if rmse_m > threshold:
         return Level.ERROR
     return Level.WARN if p95_m > threshold else Level.OK
+
+
+class RunningTotal:
+    """The errors of all frames so far, without keeping them: ``n``, ``rmse`` and ``max`` (m), and the verdict."""
+
+    def __init__(self, threshold: float) -> None:
+        self.n, self.max = 0, float("nan")
+        self._threshold, self._n_over, self._sum, self._squares = threshold, 0, 0.0, 0.0
+
+    def add(self, distances: Array) -> None:
+        """Add the errors (n,) m of one frame."""
+        self.n += len(distances)
+        self._n_over += int((distances > self._threshold).sum())
+        self._sum, self._squares = self._sum + float(distances.sum()), self._squares + float(distances @ distances)
+        self.max = float(np.fmax(self.max, distances.max(initial=0.0)))
+
+    @property
+    def rmse(self) -> float:
+        return float(np.sqrt(self._squares / self.n)) if self.n else float("nan")
+
+    @property
+    def level(self) -> Level:
+        """Judge as `verdict` does, the 95th percentile by how many errors are over the threshold."""
+        over = self._n_over > RARE * self.n
+        return verdict(self.rmse, np.inf if over else 0.0, self._threshold)
+
+    def as_dict(self) -> dict[str, float | int]:
+        """Return what a status says."""
+        mean = self._sum / self.n if self.n else float("nan")
+        return {"n": self.n, "rmse": self.rmse, "mean": mean, "max": self.max, "threshold": self._threshold}
 
 
 def frame_metrics(residual: Residual, threshold: float) -> FrameMetrics:

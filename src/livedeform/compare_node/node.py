@@ -18,7 +18,8 @@ from livedeform.common.ros import messages as m
 from livedeform.common.ros.node import CountingNode, run
 from livedeform.common.ros.session import RELIABLE, SENSOR, declare
 from livedeform.compare_node.associate import Associator
-from livedeform.compare_node.metrics import frame_metrics
+from livedeform.compare_node.judgement import level_of
+from livedeform.compare_node.metrics import RunningTotal, frame_metrics
 from livedeform.compare_node.residual import Residual
 
 
@@ -52,7 +53,7 @@ class CompareNode(CountingNode):
                 ("rmse", t.COMPARE_RMSE), ("mean", t.COMPARE_MEAN), ("p95", t.COMPARE_P95), ("max", t.COMPARE_MAX),
             )
         }  # fmt: skip
-        self._last_stamp_ns, self._fresh = 0, False
+        self._last_stamp_ns, self._fresh, self._total = 0, False, RunningTotal(self.threshold)
         self.interpolation_bound = float("nan")  # m, the largest so far
         quality = SENSOR if settings.best_effort else RELIABLE
         self.subscribe(PointCloud2, t.STEREO_MARKERS, self.on_measured, quality, gate=True)
@@ -73,6 +74,7 @@ class CompareNode(CountingNode):
         self._errors(m.to_compare_cloud(residual.stamp_ns, residual.ids, residual.measured, residual.errors))
         self.interpolation_bound = float(np.fmax(self.interpolation_bound, residual.interpolation_bound))
         metrics = frame_metrics(residual, self.threshold)
+        self._total.add(residual.distances)
         for name, publish in self._numbers.items():
             publish(m.to_float64(getattr(metrics, name)))
         values = asdict(metrics) | {"threshold": self.threshold, "interpolation_bound": residual.interpolation_bound}
@@ -84,10 +86,15 @@ class CompareNode(CountingNode):
     def metrics(self, stamp_ns: int, level: str, text: str, values: Mapping[str, Any]) -> None:
         """Publish on ``/compare/metrics`` the numbers, the verdict, and what could not be compared so far."""
         self.associator.refresh_ids()
-        counts = {f"count_{key}": value for key, value in self.associator.counts.as_dict().items()}
+        counts = {f"count_{key}": value for key, value in self.counts().items()}
         stamp = {"stamp_ns": stamp_ns, "verdict": str(level)}
         finite = {k: v for k, v in values.items() if not (isinstance(v, float) and math.isnan(v))}
         self._publish_status(m.to_diagnostics(stamp_ns, "compare_node: error", level, text, stamp | finite | counts))  # type: ignore[misc]
+
+    def counts(self) -> dict[str, Any]:
+        """Return what became of frames and predictions, those whose stamp was far from the others' among them."""
+        frames, predictions = self.n_refused(t.STEREO_MARKERS), self.n_refused(t.FEM_MARKERS)
+        return self.associator.counts.with_jumps(frames, predictions).as_dict()
 
     def watch(self) -> None:
         """Say STALE where no error could be told since the last look."""
@@ -96,12 +103,14 @@ class CompareNode(CountingNode):
         self._fresh = False
 
     def finish(self) -> None:
+        super().finish()
         for residual in self.associator.flush():
             self.publish(residual)
         counts = self.associator.counts
-        level = "OK" if counts.matched_frames else "STALE"
+        level = level_of(self._total.level, counts.matched_frames, counts.measured_frames)
         text = f"ended: {counts.matched_frames} of {counts.measured_frames} measured frames were compared"
-        self.metrics(self._last_stamp_ns, level, text, {})
+        text += f", rmse {self._total.rmse * 1e3:.3f} mm" if self._total.n else ""
+        self.metrics(self._last_stamp_ns, level, text, self._total.as_dict())
 
 
 def main(args: Sequence[str] | None = None) -> None:

@@ -48,10 +48,9 @@ class DiscretisationError:
 
     def line(self) -> str:
         """Say it in a line."""
-        return (
-            f"elements: they get the markers wrong by about {1e3 * self.rms:.3f} mm rms "
-            f"({100.0 * self.share:.1f} % of their motion) at the deepest moment"
-        )
+        share = f"{100.0 * self.share:.1f} % of their motion" if self.motion > 0.0 else "they do not move"
+        wrong = f"they get the markers wrong by about {1e3 * self.rms:.3f} mm rms"
+        return f"elements: {wrong} ({share}) at the deepest moment"
 
     def as_dict(self) -> dict[str, Any]:
         """Return what a JSON file holds."""

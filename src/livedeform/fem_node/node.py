@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import time
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 from geometry_msgs.msg import PoseStamped, WrenchStamped
@@ -13,34 +13,15 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from livedeform.common import topics as t
 from livedeform.common.experiment.yaml_file import load_experiment
-from livedeform.common.node_parameters import LATEST_NS, within
 from livedeform.common.ros import messages as m
 from livedeform.common.ros.node import CountingNode, run
 from livedeform.common.ros.session import RELIABLE, SENSOR, declare
 from livedeform.common.types import Prediction, Wrench
 from livedeform.fem_node.live.predictor import full_model, make_predictor, make_worker
 from livedeform.fem_node.live.triggers import Moment, make_requests
+from livedeform.fem_node.parameters import Parameters
 
 Tell = Callable[[str], None]
-
-
-@dataclass(frozen=True)
-class Parameters:
-    """ROS parameters. ``experiment``: folder or YAML file. ``trigger``: predict at every one of "poses", or at the
-    measured "frames" (poses interpolated), or there with "no_poses" (auto: by the experiment). ``newest_only``: skip
-    poses that come faster than the model solves. ``best_effort``: hear unreliable publishers. ``start_ns``: the start
-    (0: the first stamp). ``rest_first``: publish the surface at rest first. ``mesh_period``: s between ``/fem/mesh``.
-    ``expected``: bag of poses to prepare for. ``after``: bags (apart by ":") of what the body went through before."""
-
-    experiment: str = ""
-    trigger: str = "auto"
-    newest_only: bool = True
-    best_effort: bool = True
-    start_ns: int = within(0, 0, LATEST_NS)
-    rest_first: bool = False
-    mesh_period: float = within(0.1, 0.0, 3600.0)
-    expected: str = ""
-    after: str = ""
 
 
 class FemNode(CountingNode):
@@ -63,6 +44,7 @@ class FemNode(CountingNode):
         self._wake = self.create_guard_condition(self.publish_finished)
         self.worker = make_worker(predictor, settings.newest_only, self._wake.trigger)
         quality, probe = SENSOR if settings.best_effort else RELIABLE, self.model.physics.probe
+        self._is_live = settings.newest_only
         self._requests = make_requests(settings.trigger, probe is not None, probe.time_offset if probe else 0.0)
         self.subscribe(PoseStamped, t.PROBE_POSE, self.on_pose, quality, gate=True)
         self.subscribe(PointCloud2, t.STEREO_MARKERS, self.on_measured, quality, gate=True)
@@ -74,10 +56,14 @@ class FemNode(CountingNode):
             self._mesh(m.to_mesh_data(self.model.rest()))
 
     def on_pose(self, message: PoseStamped) -> None:
-        self.request(self._requests.on_pose(m.from_pose_stamped(message)))
+        self.request(self._requests.on_pose(m.from_pose_stamped(message), self.received_ns()))
 
     def on_measured(self, message: PointCloud2) -> None:
-        self.request(self._requests.on_frame(m.from_time(message.header.stamp)))
+        self.request(self._requests.on_frame(m.from_time(message.header.stamp), self.received_ns()))
+
+    def received_ns(self) -> int | None:
+        """Return when the message at hand came, by a clock that is not set; None in lock step."""
+        return time.monotonic_ns() if self._is_live else None
 
     def request(self, moments: list[Moment]) -> None:
         for moment in moments:
@@ -104,11 +90,19 @@ class FemNode(CountingNode):
         self.status(prediction.stamp_ns, level, said, self.counts() | values)
 
     def counts(self) -> dict[str, int]:
-        """Count what became of the poses: predicted (not converged among them), overtaken by a newer one while they
-        waited or on their way here, in hand."""
+        """Count what became of the poses: predicted (not converged among them), left out (a newer one overtook
+        them, or their stamp is wrong), in hand."""
         own = {"predicted": self.n_predicted, "not_converged": self.refused.total()}
-        overtaken = self.worker.skipped + self._requests.skipped
-        return own | {"skipped": overtaken, "unfinished": self.worker.unfinished}
+        left_out = self.worker.skipped + self._requests.skipped + self.n_refused(t.PROBE_POSE)
+        return own | {"skipped": left_out, "unfinished": self.worker.unfinished}
+
+    @property
+    def busy(self) -> bool:
+        return self.worker.busy
+
+    def finish(self) -> None:
+        super().finish()
+        self.request(self._requests.end())
 
     def destroy_node(self) -> None:
         self.worker.close()

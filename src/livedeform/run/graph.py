@@ -8,6 +8,7 @@ they are due.
 from __future__ import annotations
 
 import importlib
+import math
 import sys
 import threading
 import time
@@ -275,18 +276,17 @@ class Graph:
             node.pass_over()
 
     def finish(self, patience: float | None = None) -> None:
-        """The input has ended: every node publishes what it held back.
+        """The input has ended: each node in turn publishes what it held back, as the next may wait for it.
 
         With ``patience`` (s) messages that got lost on the way are given up after that time; they are in ``lost``.
         """
         for node in self.nodes:
             node.finish()
-        if patience is None:
-            self.settle()
-            return
-        deadline = time.monotonic() + patience
-        while self.outstanding() and time.monotonic() < deadline:
-            self.spin_once(0.05)
+            if patience is None:
+                self.settle()
+            deadline = math.inf if patience is None else time.monotonic() + patience
+            while (node.busy or self.outstanding()) and time.monotonic() < deadline:
+                self.spin_once(0.05)
 
     def crowded(self) -> dict[str, int]:
         """Topics with more than one publisher, here and outside, and how many."""

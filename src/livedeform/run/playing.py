@@ -6,7 +6,10 @@ import struct
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain, islice
 from pathlib import Path
+
+import numpy as np
 
 from livedeform.common import topics as t
 from livedeform.common.bags.read import BagReader, read_bag
@@ -14,11 +17,13 @@ from livedeform.common.bags.recording import header_stamp_ns
 from livedeform.common.bags.types import RawMessage
 from livedeform.common.errors import InputError
 from livedeform.common.ros.session import ros
+from livedeform.common.stamps import MOST_SECONDS
 from livedeform.progress import Tell
 from livedeform.run import graph as g
 
 NS = 1_000_000_000
 LAST_SECONDS = 10.0  # for listeners to acknowledge the last messages
+LOOKED_AT = 50  # messages, to tell how stamps and receive times are apart
 STAMP_AT = 4  # bytes into a message that begins with a header: behind the four of the encapsulation
 
 
@@ -75,15 +80,28 @@ def messages(bag: BagReader, names: Sequence[str], options: PlayOptions) -> Iter
     """The messages between ``start`` and ``start + duration``; with ``now`` their stamps are moved to this moment."""
     first = bag.start_ns + round(options.start * NS)
     stop = None if options.duration is None else first + round(options.duration * NS)
-    shift: int | None = None
-    for raw in bag.messages(names, first, stop):
-        if not options.now:
-            yield raw
-            continue
+    played = iter(bag.messages(names, first, stop))
+    if not options.now:
+        yield from played
+        return
+    begin = list(islice(played, LOOKED_AT))
+    shift = _shift(begin)
+    for raw in chain(begin, played):
         stamp = header_stamp_ns(raw)
-        if shift is None:
-            shift = time.time_ns() - (raw.log_time_ns if stamp is None else stamp)
-        yield raw if stamp is None else replace(raw, data=restamped(raw.data, stamp + shift))
+        moved = 0 if stamp is None else stamp + shift
+        is_date = stamp and 0 <= moved < MOST_SECONDS * NS  # one that is not set, or wrong, stays so
+        yield replace(raw, data=restamped(raw.data, moved)) if is_date else raw
+
+
+def _shift(begin: Sequence[RawMessage]) -> int:
+    """Return by how much (ns) stamps are to be moved, so that the recording that begins so happens from now on: by the
+    first of them that is no further from its receive time than is usual."""
+    known = [(stamp, raw.log_time_ns) for raw in begin if (stamp := header_stamp_ns(raw))]
+    if not known:
+        return 0
+    usual = int(np.median([stamp - received for stamp, received in known]))
+    stamp, received = next((k for k in known if abs(k[0] - k[1] - usual) < NS), known[0])
+    return time.time_ns() - stamp - (begin[0].log_time_ns - received)
 
 
 def restamped(data: bytes, stamp_ns: int) -> bytes:

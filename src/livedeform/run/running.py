@@ -117,12 +117,13 @@ class Nodes:
         """Count what became of every frame and pose."""
         out: dict[str, Any] = {}
         if self.compare is not None:
-            out["association"] = self.compare.associator.counts.as_dict()
+            out["association"] = self.compare.counts()
         if self.fem is not None:
             reasons = {"reasons": dict(self.fem.refused.most_common(MOST_REASONS))} if self.fem.refused else {}
             out["model"] = self.fem.counts() | reasons
         if self.stereo is not None:
-            out["stereo"] = {"pairs": self.stereo.pairs.n_pairs, "unpaired": self.stereo.pairs.n_unpaired}
+            unpaired = self.stereo.pairs.n_unpaired + self.stereo.n_refused(*t.IMAGES, *t.COMPRESSED_IMAGES)
+            out["stereo"] = {"pairs": self.stereo.pairs.n_pairs, "unpaired": unpaired}
         return out
 
     @property
@@ -266,7 +267,7 @@ def make_nodes(experiment: Path, plan: replay.Plan, options: RunOptions, start_n
     if plan.measured == "images" or plan.corrected:
         source = "pictures" if plan.measured == "images" else "markers"
         place = recorded_camera_pose(options.bag) if source == "markers" else ""
-        stereo = StereoNode(common | {"source": source, "rest_markers": rest, "camera_pose": place})
+        stereo = StereoNode(common | {"source": source, "rest_markers": rest, "camera_pose": place, "lone_after": 0.0})
     compare = CompareNode(
         {"experiment": str(experiment), "stale_after": 0.0 if lock_step else 2.0, "best_effort": False}
     )
@@ -364,11 +365,16 @@ def wait_for(graph: g.Graph, nodes: Nodes) -> None:
 
 @contextmanager
 def stopped_at_once(stop: StopFlag, tell: Tell) -> Iterator[None]:
-    """Goes on behind the ``with`` block after a second Ctrl-C: what was recorded until then gets its results."""
+    """Go on behind the ``with`` block after a second stop signal: what was recorded until then gets its results.
+
+    It interrupts wherever the block is; what rclpy makes of that in its own code need not be a ``KeyboardInterrupt``.
+    """
     try:
         yield
         stop.finishing = True
-    except KeyboardInterrupt:
+    except BaseException:
+        if not stop.finishing:  # a second signal sets it
+            raise
         tell("stopped at once: what is recorded so far counts")
 
 
@@ -533,11 +539,27 @@ def awaited(experiment_has_probe: bool, nodes: Nodes) -> tuple[tuple[str, ...], 
 
 
 def _listen(graph: g.Graph, nodes: Nodes, recorder: RunRecorder, watch: LiveWatch, tell: Tell) -> dict[str, Any]:
-    """Spins until interrupted; says what is missing or wrong, and every few seconds how it goes."""
+    """Spin until interrupted, and then until what has arrived is worked on; return the counts."""
+    several: dict[str, int] = {}
+    with stopped_at_once(graph.stop, tell):  # also where two signals come together, as a service's manager sends them
+        _hear(graph, nodes, recorder, watch, several, tell)
+        graph.drain(PATIENCE)
+        wait_for(graph, nodes)
+        graph.finish(PATIENCE)
+    graph.join()
+    heard = {topic: n for topic, n in recorder.counts.items() if topic in t.TOPICS and t.TOPICS[topic].input}
+    traffic = {"lost_messages": graph.lost(), "traffic": graph.balance()}
+    return nodes.counts() | traffic | {"inputs": heard, "publishers": several}
+
+
+def _hear(
+    graph: g.Graph, nodes: Nodes, recorder: RunRecorder, watch: LiveWatch, several: dict[str, int], tell: Tell
+) -> None:
+    """Spin until interrupted; say what is missing or wrong, and every few seconds how it goes. ``several``: the most
+    publishers that a topic had, where it had more than one."""
     groups = awaited(nodes.fem is not None and nodes.fem.experiment.probe is not None, nodes)
     tell("press Ctrl-C to end")
     said, moment = "", 0.0
-    several: dict[str, int] = {}
     while not graph.stop:
         graph.spin_until(time.monotonic() + 0.5)
         for topic, n in graph.crowded().items():
@@ -556,10 +578,3 @@ def _listen(graph: g.Graph, nodes: Nodes, recorder: RunRecorder, watch: LiveWatc
         if text != said and (missing or time.monotonic() - moment > SAY_EVERY):
             tell(text)
             said, moment = text, time.monotonic()
-    with stopped_at_once(graph.stop, tell):
-        graph.drain(PATIENCE)
-        wait_for(graph, nodes)
-        graph.finish(PATIENCE)
-    heard = {topic: n for topic, n in recorder.counts.items() if topic in t.TOPICS and t.TOPICS[topic].input}
-    traffic = {"lost_messages": graph.lost(), "traffic": graph.balance()}
-    return nodes.counts() | traffic | {"inputs": heard, "publishers": several}

@@ -7,8 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from livedeform.common.errors import InputError
 from livedeform.common.experiment.schema import Experiment
-from livedeform.common.frames import pose_matrix
+from livedeform.common.frames import pose_matrix, unit_pose
 from livedeform.common.types import Array, MarkerFrame, Pose
 from livedeform.stereo_node.camera.rig import StereoRig
 from livedeform.stereo_node.camera.setup import declared_camera_pose, rig_of
@@ -120,8 +121,12 @@ def parse_pose(text: str) -> Array | None:
     """Read T (4, 4) from "x y z qx qy qz qw"; None from an empty text."""
     if not text:
         return None
-    numbers = [float(word) for word in text.split()]
-    return pose_matrix(Pose(0, np.array(numbers[:3]), np.array(numbers[3:])))
+    try:
+        x, y, z, *turn = (float(word) for word in text.split())
+        return pose_matrix(unit_pose(0, (x, y, z), turn))
+    except ValueError as error:
+        remedy = 'write seven numbers, "x y z qx qy qz qw"'
+        raise InputError(f"'{text}' is no pose", where="camera_pose", remedy=remedy) from error
 
 
 def format_pose(pose: Pose) -> str:

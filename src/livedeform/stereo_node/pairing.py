@@ -11,7 +11,10 @@ import numpy as np
 from livedeform.common.stamps import StampClock, StampKind
 from livedeform.common.types import Image
 
-__all__ = ["PicturePairs", "recorded_pairs"]
+__all__ = ["PicturePairs", "Pictures", "recorded_pairs"]
+
+Pictures = list[tuple[Image, Image]]
+"""Pairs of a left and a right picture."""
 
 LATE = 5  # pictures of one camera without any of the other
 SAY_EVERY_NS = 1_000_000_000
@@ -37,6 +40,7 @@ class PicturePairs:
         self._alone = [0, 0]  # pictures of each camera since the other's last
         self._unpaired_in_a_row = 0
         self._said_ns = 0
+        self._was_lone = False
         self.n_pairs = self.n_unpaired = 0
 
     @property
@@ -77,15 +81,15 @@ class PicturePairs:
         self._said_ns = stamp_ns
         return trouble
 
-    def add_left(self, image: Image) -> list[tuple[Image, Image]]:
+    def add_left(self, image: Image) -> Pictures:
         """Take a left picture and return the pairs that are now complete."""
         return self._add(0, image)
 
-    def add_right(self, image: Image) -> list[tuple[Image, Image]]:
+    def add_right(self, image: Image) -> Pictures:
         """Take a right picture and return the pairs that are now complete."""
         return self._add(1, image)
 
-    def _add(self, side: int, image: Image) -> list[tuple[Image, Image]]:
+    def _add(self, side: int, image: Image) -> Pictures:
         queue = self._waiting[side]
         self._alone[side], self._alone[1 - side] = self._alone[side] + 1, 0
         self._stamps[side].append(image.stamp_ns)
@@ -103,11 +107,18 @@ class PicturePairs:
         queue.append(image)
         return self._complete()
 
-    def flush(self) -> list[tuple[Image, Image]]:
+    def flush(self) -> Pictures:
         """End the streams: return the pair that waited for the cameras' period to show."""
         return self._complete(ended=True)
 
-    def _complete(self, ended: bool = False) -> list[tuple[Image, Image]]:
+    def lone(self) -> Pictures:
+        """Return the first pair if it waited for the cameras' period at the last call, too: no other picture came."""
+        waits = self._limit_ns() is None and all(self._waiting)
+        pairs = self._complete(ended=True) if waits and self._was_lone else []
+        self._was_lone = waits and not pairs
+        return pairs
+
+    def _complete(self, ended: bool = False) -> Pictures:
         left, right = self._waiting
         pairs = []
         while left and right:

@@ -1,10 +1,15 @@
-"""Parameters of stereo_node."""
+"""Parameters of stereo_node, and what is made of them."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
+from livedeform.common.experiment.markers_file import read_markers
 from livedeform.common.node_parameters import LATEST_NS, within
+from livedeform.common.types import Array, Ids
+from livedeform.stereo_node.pairing import PicturePairs
+from livedeform.stereo_node.track.model_prior import ModelPrior
 
 
 @dataclass(frozen=True)
@@ -16,7 +21,9 @@ class StereoParameters:
     experiment declares. ``camera_pose``: T_phantom_left as "x y z qx qy qz qw" for source "markers".
     ``pair_tolerance``: s between left and right picture, beyond their offset, but at most 0.4 of the cameras' period.
     ``pair_offset``: s by which the right camera's stamps are later although it looks at the same moment.
-    ``best_effort``: hear cameras that are not reliable. ``start_ns``: the recording's start (0: the first stamp).
+    ``lone_after``: s without another picture after which the first of each camera are a pair, although their period
+    does not show yet; 0: never. ``best_effort``: hear cameras that are not reliable.
+    ``start_ns``: the recording's start (0: the first stamp).
     ``model_prior``: look for markers that come back where ``/fem/markers`` predicts them, as far as the markers that
     are seen agree. ``model_prior_age``: s by which that prediction may be older or newer than the pictures.
     """
@@ -27,7 +34,20 @@ class StereoParameters:
     camera_pose: str = ""
     pair_tolerance: float = within(0.005, 0.0, 1.0)
     pair_offset: float = within(0.0, -10.0, 10.0)
+    lone_after: float = within(1.0, 0.0, 3600.0)
     best_effort: bool = True
     start_ns: int = within(0, 0, LATEST_NS)
     model_prior: bool = False
     model_prior_age: float = within(0.2, 0.0, 10.0)
+
+    def picture_pairs(self) -> PicturePairs:
+        """Return what pairs the pictures."""
+        return PicturePairs(round(self.pair_tolerance * 1e9), expected_ns=round(self.pair_offset * 1e9))
+
+    def rest(self) -> Array | None:
+        """Return the markers at rest (n, 3) m; None where they are as the experiment declares them."""
+        return read_markers(Path(self.rest_markers)).points if self.rest_markers else None
+
+    def prior(self, ids: Ids) -> ModelPrior:
+        """Return what keeps the predictions of the markers ``ids``."""
+        return ModelPrior(ids, round(self.model_prior_age * 1e9))

@@ -25,8 +25,8 @@ from livedeform.common.bags.read import BagReader, read_bag
 from livedeform.common.bags.types import RawMessage, decode
 from livedeform.common.errors import RecordingError
 from livedeform.common.experiment.schema import Experiment
-from livedeform.common.frames import NO_ROTATION, unit_pose, unit_poses
-from livedeform.common.stamps import bad_stamps, read_stamp
+from livedeform.common.frames import NO_ROTATION, odd_norms, unit_pose, unit_poses
+from livedeform.common.stamps import bad_stamps, read_stamp, times_set_back
 from livedeform.common.types import Array, CameraCalibration, Ids, Image, MarkerFrame, Pose, PredictedMarkers, Wrench
 
 __all__ = ["ErrorFrame", "Recording", "load_poses", "load_recording", "read_images"]
@@ -73,7 +73,8 @@ class Recording:
     ``warnings`` has one line per thing that was left out or looks odd, ``faults`` counts the same by name
     (`common.checks.recorded.FAULTS`). ``unknown_ids`` are of markers that the experiment does not have;
     ``picture_stamps_ns`` of the first and last left pictures. ``repeats`` counts by topic the messages whose stamp was
-    there already: how many were ``left_out``, and how many ``joined``.
+    there already: how many were ``left_out``, and how many ``joined``; ``other_frames`` by topic the frame that it
+    says, where that is not the phantom's.
     """
 
     path: Path
@@ -94,6 +95,7 @@ class Recording:
     unknown_ids: tuple[int, ...] = ()
     picture_stamps_ns: tuple[int, ...] = ()
     repeats: Mapping[str, Repeats] = field(default_factory=dict)
+    other_frames: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def own_name(self) -> str:
@@ -163,6 +165,7 @@ def load_recording(path: Path | str, experiment: Experiment | None = None) -> Re
         unknown_ids=tuple(sorted(collector.unknown)),
         picture_stamps_ns=pictures,
         repeats=collector.repeats,
+        other_frames=collector.other_frames,
     )
 
 
@@ -352,6 +355,7 @@ class _Collector:
         self.unknown: set[int] = set()
         self.sound_ids: set[bytes] = set()  # of frames that are kept as they are
         self.repeats: dict[str, Repeats] = {}
+        self.other_frames: dict[str, str] = {}
         self.given = True  # markers, which are found in the pictures where there are any
         self._bad_ns: set[int] = set()
         self._good_ns: set[int] = set()
@@ -385,6 +389,8 @@ class _Collector:
                 continue
             read |= {row: item for row, item in zip(found.rows, items, strict=True) if item is not None}
             self._check(topic, found.frame_id, n_wrong, sum(item is not None for item in items))
+            if topic == t.PROBE_POSE:
+                self.faults["norm"] += odd_norms(found.values[[item is not None for item in items], 3:])
         for row, raw in enumerate(raws):
             item = read.get(row)
             if item is not None:
@@ -401,6 +407,9 @@ class _Collector:
             if raw.topic in self.items:
                 item, n_wrong = _one(raw.topic, message)
                 self._check(raw.topic, message.header.frame_id, n_wrong)
+                if raw.topic == t.PROBE_POSE:
+                    q = message.pose.orientation
+                    self.faults["norm"] += odd_norms(np.array([[q.x, q.y, q.z, q.w]]))
                 self.items[raw.topic].append(item)
                 self.received[raw.topic].append(raw.log_time_ns)
             elif raw.topic in _CAMERAS:
@@ -417,7 +426,7 @@ class _Collector:
     def _check(self, topic: str, frame_id: str, n_wrong: int, n: int = 1) -> None:
         """Count what is odd about ``n`` messages of one frame, with ``n_wrong`` impossible covariances."""
         if n and topic in _PHANTOM_TOPICS and frame_id not in (t.FRAME_PHANTOM, ""):
-            self.count(f"{topic}: taken to be in the frame '{t.FRAME_PHANTOM}' although it says '{frame_id}'", n)
+            self.other_frames.setdefault(topic, frame_id)
         if n_wrong:
             self.count(f"{topic}: covariances that are negative, infinite or incomplete are taken as unknown", n_wrong)
             self.faults["covariance"] += n_wrong
@@ -438,6 +447,8 @@ class _Collector:
             self.faults["stamp"] += int(bad.sum())
         self.faults["unset"] += len(stamps) > 1 and not any(stamps)
         good = [item for item, wrong in zip(self.items[topic], bad, strict=True) if not wrong]
+        if t.TOPICS[topic].input:
+            self.faults["set_back"] += times_set_back([item.stamp_ns for item in good])
         unique: list[Any] = []
         joined = 0
         for item in sorted(good, key=lambda item: item.stamp_ns):

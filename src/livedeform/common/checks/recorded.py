@@ -32,7 +32,7 @@ def check_recording(recording: Recording, experiment: Experiment) -> list[Findin
     """Everything that can be told from the recording's numbers, without its pictures, and of what is declared."""
     body = read_body(experiment)
     checks: Sequence[Callable[[Recording, Experiment, Surface], list[Finding]]] = (
-        check_faults, check_ids, check_inputs, check_stamps, check_gaps, check_places, check_exchanges,
+        check_faults, check_frames, check_ids, check_inputs, check_stamps, check_gaps, check_places, check_exchanges,
         check_probe, check_release, check_drifts,
     )  # fmt: skip
     found = [finding for check in checks for finding in check(recording, experiment, body)]
@@ -80,9 +80,14 @@ FAULTS: dict[str, tuple[Severity, str, str]] = {
     "stamp": ("WARN", "messages whose stamp cannot be right are left out", "check the clocks"),
     "quaternion": ("WARN", "poses whose orientation is no rotation are left out", "check the robot's poses"),
     "not_finite": ("NOTE", "markers whose coordinates are not finite are left out", ""),
+    "norm": ("WARN", "poses whose quaternion's norm is not 1 are taken for the rotation that it is a multiple of",
+             "record a unit quaternion x, y, z, w; angles are none"),
+    "set_back": ("WARN", "clocks were set back meanwhile: moments before and after lie between each other",
+                 "record again, with clocks that nobody sets"),
     "unset": ("ERROR", "every stamp is 0", "set header.stamp when recording"),
 }  # fmt: skip
 """Counted by ``load_recording``: level, what, remedy."""
+DOUBTFUL = {"norm", "set_back"}  # faults that may spoil what is concluded
 
 
 def check_faults(recording: Recording, experiment: Experiment, body: Surface) -> list[Finding]:
@@ -91,8 +96,20 @@ def check_faults(recording: Recording, experiment: Experiment, body: Surface) ->
     for name, (level, text, remedy) in FAULTS.items():
         n = recording.faults.get(name, 0)
         if n:
-            found.append(Finding(level, text if level == "ERROR" else f"{text} ({n})", remedy))
+            said = text if level == "ERROR" else f"{text} ({n})"
+            found.append(Finding(level, said, remedy, doubts=name in DOUBTFUL))
     return found
+
+
+def check_frames(recording: Recording, experiment: Experiment, body: Surface) -> list[Finding]:
+    """Check whether what is measured is said to be in the phantom's frame."""
+    return [other_frame(topic, frame) for topic, frame in recording.other_frames.items()]
+
+
+def other_frame(topic: str, frame: str) -> Finding:
+    """Doubt a topic that says to be in another frame."""
+    text = f"{topic} is in the frame '{frame}', and taken to be '{t.FRAME_PHANTOM}'"
+    return Finding("WARN", text, "record it in the phantom's frame", doubts=True)
 
 
 def check_stamps(recording: Recording, experiment: Experiment, body: Surface) -> list[Finding]:

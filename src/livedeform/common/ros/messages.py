@@ -20,7 +20,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 from livedeform.common import topics as t
 from livedeform.common.bags import layouts, pictures
 from livedeform.common.experiment.schema import Lesion
-from livedeform.common.frames import unit_pose
+from livedeform.common.frames import inverse, matrix_pose, unit_pose
 from livedeform.common.stamps import read_stamp
 from livedeform.common.types import (
     Array,
@@ -77,6 +77,12 @@ def to_transform(pose: Pose, parent: str, child: str) -> TransformStamped:
     translation.x, translation.y, translation.z = (float(v) for v in pose.position)
     rotation.x, rotation.y, rotation.z, rotation.w = (float(v) for v in pose.orientation_xyzw)
     return message
+
+
+def to_camera_transforms(stamp_ns: int, T_phantom_left: Array, T_right_left: Array) -> list[TransformStamped]:
+    """Make the messages of where the cameras are: T_phantom_left and T_left_right."""
+    left, right = matrix_pose(T_phantom_left, stamp_ns), matrix_pose(inverse(T_right_left), stamp_ns)
+    return [to_transform(left, t.FRAME_PHANTOM, t.FRAME_LEFT), to_transform(right, t.FRAME_LEFT, t.FRAME_RIGHT)]
 
 
 def to_float64(value: float) -> Float64:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from copy import copy
 from typing import Any
 
@@ -43,6 +44,7 @@ class CountingNode(Node):
         self.inlets: dict[str, Subscription] = {}
         self.outlets: dict[str, Publisher] = {}
         self.gates: dict[str, StampGate[Any]] = {}
+        self._handlers: dict[str, Callable[[Any], None]] = {}  # of the topics that have a gate
         self._publish_status = self.publisher(DiagnosticArray, status_topic) if status_topic else None
         if self.get_parameter("use_sim_time").value:
             self._clock_watch = self.create_timer(CLOCK_SECONDS, self._say_no_clock, clock=Clock())
@@ -63,15 +65,14 @@ class CountingNode(Node):
         """
         gatekeeper = StampGate[Any]()
         if gate:
-            self.gates[topic] = gatekeeper
+            self.gates[topic], self._handlers[topic] = gatekeeper, handle
 
         def callback(message: Any, info: Mapping[str, Any]) -> None:
             self.traffic.receive(topic, self._number(subscription, info))
             try:
-                for admitted in gatekeeper.admit(from_time(message.header.stamp), message) if gate else [message]:
-                    handle(admitted)
-            except LivedeformError as error:
-                self.status(0, "ERROR", str(error))
+                with self.bad_input_said():
+                    for admitted in gatekeeper.admit(from_time(message.header.stamp), message) if gate else [message]:
+                        handle(admitted)
             finally:
                 self.traffic.handled[topic] += 1
 
@@ -84,6 +85,18 @@ class CountingNode(Node):
             event_callbacks=SubscriptionEventCallbacks(incompatible_qos=self._refuses(topic, "publisher")),
             qos_overriding_options=QoSOverridingOptions.with_default_policies(),
         )
+
+    @contextmanager
+    def bad_input_said(self) -> Iterator[None]:
+        """Go on behind the ``with`` block after a ``LivedeformError``, with its text as the status."""
+        try:
+            yield
+        except LivedeformError as error:
+            self.status(0, "ERROR", str(error))
+
+    def n_refused(self, *topics: str) -> int:
+        """Count the messages of ``topics`` that were left out since their stamp was far from the others'."""
+        return sum(self.gates[topic].refused for topic in topics if topic in self.gates)
 
     def publisher(self, kind: type, topic: str) -> Callable[[Any], None]:
         """Return a function that publishes and counts; latched topics are those of the table of topics."""
@@ -164,8 +177,17 @@ class CountingNode(Node):
     def start(self) -> None:
         """Publish what others need before anything else: everything is connected."""
 
+    @property
+    def busy(self) -> bool:
+        """Tell whether the node works on something that it will publish."""
+        return False
+
     def finish(self) -> None:
         """Publish what was held back: the input has ended."""
+        for topic, gate in self.gates.items():
+            for held in gate.end():
+                with self.bad_input_said():
+                    self._handlers[topic](held)
 
 
 def run(make: Callable[[], CountingNode], args: Sequence[str] | None = None) -> None:

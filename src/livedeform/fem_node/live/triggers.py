@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from livedeform.common.errors import InputError
 from livedeform.common.frames import slerp
-from livedeform.common.stamps import StampClock, StampKind
+from livedeform.common.stamps import StampClock, StampKind, StampOrder
 from livedeform.common.types import Pose
 
 Moment = tuple[
@@ -20,51 +20,60 @@ Moment = tuple[
 
 
 class Requests(Protocol):
-    """Poses and frames come in; moments to predict come out. ``skipped`` counts poses that nothing comes of, as they
-    came after a later one."""
+    """Poses and frames come in, live with the time when they were received; moments to predict come out, and in the
+    end those that were held back. ``skipped`` counts what nothing comes of: it came after a later one, or its stamp is
+    wrong."""
 
     @property
     def skipped(self) -> int: ...
 
-    def on_pose(self, pose: Pose) -> list[Moment]: ...
+    def on_pose(self, pose: Pose, received_ns: int | None = None) -> list[Moment]: ...
 
-    def on_frame(self, stamp_ns: int) -> list[Moment]: ...
+    def on_frame(self, stamp_ns: int, received_ns: int | None = None) -> list[Moment]: ...
+
+    def end(self) -> list[Moment]: ...
 
 
-class AtPoses:
-    """One prediction per pose, but for one that comes after a later one: time does not go back, and a body with a
-    memory would age anew."""
+class _InOrder:
+    """Moments in the order of their stamps: time does not go back, and a body with a memory would age anew, or, by one
+    wrong stamp, at once."""
 
     def __init__(self) -> None:
-        self.skipped = 0
-        self._clock = StampClock()
+        self._order = StampOrder[Moment]()
 
-    def on_pose(self, pose: Pose) -> list[Moment]:
-        if self._clock.take(pose.stamp_ns) is StampKind.LATE:
-            self.skipped += 1
-            return []
-        return [(pose, None)]
+    @property
+    def skipped(self) -> int:
+        return self._order.refused
 
-    def on_frame(self, stamp_ns: int) -> list[Moment]:
+    def end(self) -> list[Moment]:
+        return self._order.end()
+
+
+class AtPoses(_InOrder):
+    """One prediction per pose."""
+
+    def on_pose(self, pose: Pose, received_ns: int | None = None) -> list[Moment]:
+        return self._order.admit(pose.stamp_ns, (pose, None), received_ns)
+
+    def on_frame(self, stamp_ns: int, received_ns: int | None = None) -> list[Moment]:
         return []
 
 
-class WithoutPoses:
+class WithoutPoses(_InOrder):
     """One prediction per measured frame, without a probe; markers and surface points of one moment count once."""
 
-    skipped = 0
-
     def __init__(self) -> None:
+        super().__init__()
         self._last_ns: int | None = None
 
-    def on_pose(self, pose: Pose) -> list[Moment]:
+    def on_pose(self, pose: Pose, received_ns: int | None = None) -> list[Moment]:
         return []
 
-    def on_frame(self, stamp_ns: int) -> list[Moment]:
+    def on_frame(self, stamp_ns: int, received_ns: int | None = None) -> list[Moment]:
         if stamp_ns == self._last_ns:
             return []
         self._last_ns = stamp_ns
-        return [(None, stamp_ns)]
+        return self._order.admit(stamp_ns, (None, stamp_ns), received_ns)
 
 
 class AtFrames:
@@ -81,7 +90,7 @@ class AtFrames:
         self._frames: deque[int] = deque(maxlen=10_000)
         self._pose_clock, self._frame_clock = StampClock(max_gap_ns), StampClock(max_gap_ns)
 
-    def on_pose(self, pose: Pose) -> list[Moment]:
+    def on_pose(self, pose: Pose, received_ns: int | None = None) -> list[Moment]:
         true_ns = pose.stamp_ns - self._late_ns
         step = self._pose_clock.take(true_ns)
         if step is StampKind.UNMASKS and self._poses and self._poses[-1].stamp_ns > true_ns:
@@ -92,7 +101,7 @@ class AtFrames:
             self._poses.append(Pose(true_ns, pose.position, pose.orientation_xyzw))
         return self._ready()
 
-    def on_frame(self, stamp_ns: int) -> list[Moment]:
+    def on_frame(self, stamp_ns: int, received_ns: int | None = None) -> list[Moment]:
         step = self._frame_clock.take(stamp_ns)
         if step is StampKind.UNMASKS and self._frames and self._frames[-1] > stamp_ns:
             self._frames.pop()
@@ -101,6 +110,9 @@ class AtFrames:
         if not self._frames or stamp_ns > self._frames[-1]:
             self._frames.append(stamp_ns)
         return self._ready()
+
+    def end(self) -> list[Moment]:
+        return []
 
     def _known(self, stamp_ns: int) -> bool:
         """Tell whether the poses reach a moment."""
