@@ -13,6 +13,7 @@ from livedeform.common.bags import layouts
 from livedeform.common.bags.recording import header_stamp_ns, load_recording, own_name, read_images
 from livedeform.common.bags.recording_writer import RecordingWriter
 from livedeform.common.bags.write import BagWriter
+from livedeform.common.checks.recorded import check_frames
 from livedeform.common.errors import RecordingError
 from livedeform.common.experiment.yaml_file import load_experiment
 from livedeform.common.types import CameraCalibration, Image, MarkerFrame, Pose, Wrench
@@ -119,7 +120,10 @@ def test_wrenches_that_are_no_numbers_are_left_out(write, n):
 def test_another_frame_is_pointed_out(tmp_path):
     with BagWriter(tmp_path / "x.mcap") as bag:
         RecordingWriter(bag).marker_frame(frame(1, [1], [[0, 0, 0]]), frame_id="qualisys")
-    assert any("says 'qualisys'" in line for line in load_recording(tmp_path / "x.mcap").warnings)
+    recording = load_recording(tmp_path / "x.mcap")
+    (finding,) = check_frames(recording, None, None)  # type: ignore[arg-type]
+    assert finding.text == "/stereo/markers is in the frame 'qualisys', and taken to be 'phantom'"
+    assert finding.level == "WARN" and finding.doubts
 
 
 def test_header_stamps_are_read_without_decoding(write):
