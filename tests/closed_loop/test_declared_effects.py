@@ -155,7 +155,7 @@ def test_the_last_value_that_is_possible_is_no_doubt() -> None:
     assert not any("end of what is tried" in doubt for doubt in found.doubts)
 
 
-@pytest.mark.parametrize("place", [0, 3])
+@pytest.mark.parametrize("place", [0, pytest.param(3, marks=pytest.mark.slow)])
 def test_a_campaign_pools_takes_that_declare_an_effect_with_others(place: int, tmp_path: Path) -> None:
     """One whose experiment declares a relaxation took it from all others, if it was the first of them."""
     pytest.importorskip("pyarrow")

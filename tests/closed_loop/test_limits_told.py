@@ -50,7 +50,7 @@ def test_a_value_at_the_end_of_what_is_tried_is_doubted(effect: tuple[str, float
     assert any("at the end of what is tried" in doubt for doubt in found.doubts) is at_the_end
 
 
-@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_what_goes_with_the_speed_is_seen(seed: int) -> None:
     """A clock 0.06 s late, of which no candidate knows, was `none`: within the noise, at 20 sigma of its chi2."""
     others = tuple(name for name in toy.NAMES if name != "time_offset")

@@ -83,7 +83,14 @@ def test_what_is_added_was_fitted_to_its_end(seed: int) -> None:
     assert found.after.rmse < 1.05 * found.floor
 
 
-@pytest.mark.parametrize("missing", ["in one of two fits", "nowhere", "in the test"])
+@pytest.mark.parametrize(
+    "missing",
+    [
+        "in one of two fits",
+        pytest.param("nowhere", marks=pytest.mark.slow),
+        pytest.param("in the test", marks=pytest.mark.slow),
+    ],
+)
 def test_a_recording_without_a_force_leaves_the_others_theirs(missing: str) -> None:
     """A softer body sags as a heavier one does, and the force tells; it was left out of all recordings."""
     effects = [toy.effect("stiffness", ratio=0.8)]
@@ -114,7 +121,7 @@ def test_points_that_the_tracker_states_to_be_poor_make_nothing_up(seed: int, ra
         assert value == pytest.approx(true, rel=0.03)  # measured 0.015
 
 
-@pytest.mark.parametrize(("seed", "seconds"), [(0, 2.0), (1, 4.0), (0, 10.0)])
+@pytest.mark.parametrize(("seed", "seconds"), [(0, 2.0), pytest.param(1, 4.0, marks=pytest.mark.slow), (0, 10.0)])
 def test_an_error_that_changes_slowly_is_not_said_to_be_physics(seed: int, seconds: float) -> None:
     """It was `unexplained`, with p = 0: within the presses it lasts for, no recording tells it from motion."""
     fit, test = (

@@ -66,7 +66,7 @@ def diagnosed(truth: list[EffectValues], onset: float, names: Sequence[str], see
     return investigate(FilmedModel(toy.ToyBody(PLACES)), Filmed(**given), seed=seed)
 
 
-@pytest.mark.parametrize("onset", [7.3, 19.1])
+@pytest.mark.parametrize("onset", [7.3, pytest.param(19.1, marks=pytest.mark.slow)])
 def test_cameras_that_were_bumped_where_it_was_fitted_are_named(onset):
     found = diagnosed([], onset, toy.NAMES)
     assert found.verdict == "effect" and [e.name for e in found.effects] == ["camera_motion"]
