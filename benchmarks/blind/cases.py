@@ -181,8 +181,13 @@ def _varied(plan: Mapping[str, Any], seed: int) -> dict[str, Any]:
 
 
 def sized(name: str, size: float) -> dict[str, Any]:
-    """An effect at ``size`` times what noise allows to see: its difference from nothing is scaled."""
-    values = copy.deepcopy(VISIBLE.get(name) or OUTSIDE[name])
+    """An effect at ``size`` times what noise allows to see."""
+    return scaled({"name": name, **(VISIBLE.get(name) or OUTSIDE[name])}, size)
+
+
+def scaled(effect: Mapping[str, Any], size: float) -> dict[str, Any]:
+    """An effect whose difference from nothing is scaled; where it acts, and from when, stays."""
+    name, values = effect["name"], {key: copy.deepcopy(value) for key, value in effect.items() if key != "name"}
     if name in ("base_slip",):
         values["stiffness"] /= size
     elif name == "camera_motion":

@@ -7,18 +7,16 @@ is missing is about twice the tracker's noise, of every third of these once.
 
 from __future__ import annotations
 
-import copy
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from benchmarks.blind.cases import NEUTRAL, VISIBLE, Case
+from benchmarks.blind.cases import VISIBLE, Case, scaled
 from benchmarks.blind.random_cases import N_NONE, N_OF, RandomCase, conditions, drawn_effect
 
 FIRST_SEED = 1000
-IN_PROPORTION = ("inclusion", "skin")  # their ratios are no more than half there by their square roots
 
 
 @dataclass(frozen=True)
@@ -28,28 +26,9 @@ class RedeclaredCase(RandomCase):
     def scenario(self) -> dict[str, Any]:
         """Return the scenario of the case."""
         spec = super().scenario()
-        listed = self.effects if self.kind == "none" else [halved(effect) for effect in self.effects]
+        listed = self.effects if self.kind == "none" else [scaled(effect, 0.5) for effect in self.effects]
         spec["declared"]["effects"] = [dict(effect) for effect in listed]
         return spec
-
-
-def halved(effect: Mapping[str, Any]) -> dict[str, Any]:
-    """Return an effect that is half as far from nothing; where it acts, and from when, stays."""
-    less, name = copy.deepcopy(dict(effect)), effect["name"]
-    if name == "base_slip":
-        less["stiffness"] *= 2.0
-    elif name in IN_PROPORTION:
-        less["ratio"] **= 0.5
-    elif name == "camera_motion":
-        less |= {key: [v / 2.0 for v in less[key]] for key in ("translation", "rotation")}
-    elif name == "gravity_tilt":
-        less |= {key: less[key] / 2.0 for key in ("angle_x", "angle_y")}
-    else:
-        key = next(iter(VISIBLE[name]))
-        nothing = NEUTRAL.get(key, 0.0)
-        half = (nothing + np.asarray(less[key], float)) / 2.0
-        less[key] = half.tolist()
-    return less
 
 
 def redeclared(n: int = 60) -> list[Case]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,10 +16,13 @@ import scene
 
 from livedeform.common import topics as t
 from livedeform.common.bags.recording_writer import RecordingWriter
+from livedeform.common.bags.types import RawMessage
 from livedeform.common.bags.write import BagWriter
 from livedeform.common.types import Image, MarkerFrame, Pose, Prediction
 from livedeform.fem_node.mesh.generate import write_mesh
 from livedeform.fem_node.mesh.structured import block_mesh
+from livedeform.run.graph import Player
+from livedeform.run.scene import written
 from livedeform.stereo_node.camera.calibration_file import write_camera
 from livedeform.stereo_node.camera.rig import StereoRig
 
@@ -147,3 +150,9 @@ class Filmed:
     bag: Path
     direct: list[Prediction]
     pairs: list[tuple[Image, Image]]
+
+
+def play(player: Player, write: Callable[[RecordingWriter], None]) -> None:
+    """Send the messages that ``write`` makes to whoever listens."""
+    for topic, kind, data in written(write):
+        player.play(RawMessage(topic, kind, 0, data))

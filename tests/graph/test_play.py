@@ -16,7 +16,7 @@ from livedeform.common.bags.read import read_bag
 from livedeform.common.bags.write import BagWriter
 from livedeform.common.errors import InputError
 from livedeform.run.playing import PlayOptions, chosen, messages
-from livedeform.run.scene import _written
+from livedeform.run.scene import written
 
 PLAY = "from livedeform.cli import main; main()"
 
@@ -71,7 +71,7 @@ def test_one_wrong_stamp_moves_no_other(name: str, tmp_path: Path):
     with BagWriter(tmp_path / "x.mcap") as bag:
         for k, pose in enumerate(poses):
             stamped = replace(pose, stamp_ns=change(pose.stamp_ns)) if k == at else pose
-            for topic, kind, data in _written(lambda w, stamped=stamped: w.pose(stamped)):
+            for topic, kind, data in written(lambda w, stamped=stamped: w.pose(stamped)):
                 bag.write(topic, kind, pose.stamp_ns, data)
     with read_bag(tmp_path / "x.mcap") as opened:
         before = time.time_ns()

@@ -18,7 +18,6 @@ from processes import Conversation, conversation, raw_messages, shifted
 from small import Filmed
 
 from livedeform.common import topics as t
-from livedeform.common.bags.types import RawMessage
 from livedeform.common.experiment.yaml_file import load_experiment
 from livedeform.common.ros.session import ros
 from livedeform.common.types import Pose, Prediction
@@ -26,7 +25,6 @@ from livedeform.fem_node.live.predictor import make_predictor
 from livedeform.fem_node.node import FemNode
 from livedeform.run.graph import Graph, Player
 from livedeform.run.running import isolated
-from livedeform.run.scene import _written
 
 HEIGHTS = (0.0, 0.001, 0.005, 0.02, 0.1, 0.5)  # m above the body
 DEPTH = 0.002
@@ -181,8 +179,7 @@ def test_a_pose_stamped_ahead_waits_for_the_next_one(last: bool, experiment: Pat
         with Graph([fem, player], stop) as graph:
             graph.start()
             for pose in poses:
-                for topic, kind, data in _written(lambda w, pose=pose: w.pose(pose)):
-                    player.play(RawMessage(topic, kind, 0, data))
+                small.play(player, lambda w, pose=pose: w.pose(pose))
                 graph.settle()
                 while fem.busy:
                     graph.spin_once(0.05)

@@ -23,14 +23,13 @@ from livedeform.common import topics as t
 from livedeform.common.bags.read import read_bag
 from livedeform.common.bags.recording import load_recording
 from livedeform.common.bags.recording_writer import RecordingWriter
-from livedeform.common.bags.types import RawMessage, decode
+from livedeform.common.bags.types import decode
 from livedeform.common.bags.write import BagWriter
 from livedeform.common.ros.session import ros
 from livedeform.common.types import MarkerFrame, Pose, Prediction
 from livedeform.compare_node.node import CompareNode
 from livedeform.run.graph import Graph, Player
 from livedeform.run.running import RunOptions, isolated, run
-from livedeform.run.scene import _written
 
 CODE = "from livedeform.cli import main; main()"
 YEAR_NS = 365 * 86_400_000_000_000
@@ -274,8 +273,7 @@ def test_a_message_that_a_gate_refuses_is_counted(experiment: Path, direct: list
         with Graph([compare, player], stop) as graph:
             graph.start()
             for frame in frames:
-                for topic, kind, data in _written(lambda w, frame=frame: w.marker_frame(frame)):
-                    player.play(RawMessage(topic, kind, 0, data))
-                    graph.settle()
+                small.play(player, lambda w, frame=frame: w.marker_frame(frame))
+                graph.settle()
             counts = compare.counts()
     assert (counts["measured_frames"], counts["refused_out_of_order"]) == (12, 1)

@@ -17,7 +17,7 @@ from livedeform.common.ros.session import RELIABLE, ros
 from livedeform.common.types import Pose, Prediction
 from livedeform.run.graph import Graph
 from livedeform.run.running import isolated
-from livedeform.run.scene import _written
+from livedeform.run.scene import written
 from livedeform.run.watch import LiveWatch
 
 
@@ -71,8 +71,8 @@ def test_another_frame_and_a_clock_that_is_set_back_are_said_while_they_come(
         frame = replace(small.frame(pose.stamp_ns, direct[0].ids, direct[0].markers))
         back = 1_000_000_000 * (k >= 25) - 7
         for topic, kind, data in [
-            *_written(lambda w, frame=frame: w.marker_frame(frame, "tracker")),
-            *_written(lambda w, pose=pose, back=back: w.pose(replace(pose, stamp_ns=pose.stamp_ns - back))),
+            *written(lambda w, frame=frame: w.marker_frame(frame, "tracker")),
+            *written(lambda w, pose=pose, back=back: w.pose(replace(pose, stamp_ns=pose.stamp_ns - back))),
         ]:
             watch.take(topic, kind, data)
     said = " ".join(finding.text for finding in watch.news())

@@ -142,10 +142,10 @@ def test_the_tables_and_the_page(tmp_path: Path) -> None:
 
 def test_bare_recordings_of_runs_are_paired_only_if_of_one_recording() -> None:
     """Without results beside them stamps that are alike made pairs of two recordings, as imported ones begin at 0."""
-    runs = [replace(made(k, noise(4, 1e-3)), source=source) for k, source in (("a", "x"), ("b", "y"), ("c", "x"))]
+    runs = [replace(made(k, noise(4, 1e-3)), digest=digest) for k, digest in (("a", "x"), ("b", "y"), ("c", "x"))]
     assert compared(runs[0], runs[1]) is None
     assert compared(runs[0], runs[2]) is not None
-    assert compared(runs[0], replace(runs[1], source="")) is not None  # nothing is known of it
+    assert compared(runs[0], replace(runs[1], digest="")) is not None  # nothing is known of it
 
 
 @pytest.mark.parametrize(

@@ -215,15 +215,17 @@ def test_a_page_holds_claims_figures_and_numbers(tmp_path: Path) -> None:
     assert (tmp_path / "line.svg").exists()
 
 
+def good(out: Path, data: Path | None, progress: object) -> dict:
+    page = StudyPage("good", "Good", "?", out)
+    page.claim("it is", "1", "2", HOLDS)
+    return page.finish()
+
+
+def absent(out: Path, data: Path | None, progress: object) -> dict:
+    raise InputError("this study needs data", remedy="get it")
+
+
 def test_booklet_names_what_is_missing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def good(out: Path, data: Path | None, progress: object) -> dict:
-        page = StudyPage("good", "Good", "?", out)
-        page.claim("it is", "1", "2", HOLDS)
-        return page.finish()
-
-    def absent(out: Path, data: Path | None, progress: object) -> dict:
-        raise InputError("this study needs data", remedy="get it")
-
     monkeypatch.setattr(booklet, "STUDIES", {"good": good, "absent": absent})
     document = booklet.make_booklet(tmp_path, None, quiet)
     html = (tmp_path / "index.html").read_text()
@@ -236,16 +238,8 @@ def test_a_fault_in_one_study_of_all_takes_nothing_from_the_others(
 ) -> None:
     """A study that failed to converge was missing from the booklet with exit code 0, and a fault left no booklet."""
 
-    def good(out: Path, data: Path | None, progress: object) -> dict:
-        page = StudyPage("good", "Good", "?", out)
-        page.claim("it is", "1", "2", HOLDS)
-        return page.finish()
-
     def faulty(out: Path, data: Path | None, progress: object) -> dict:
         raise np.linalg.LinAlgError("Singular matrix")
-
-    def absent(out: Path, data: Path | None, progress: object) -> dict:
-        raise InputError("this study needs data", remedy="get it")
 
     for studies, code in (({"faulty": faulty, "good": good}, 2), ({"absent": absent, "good": good}, 0)):
         out = tmp_path / str(code)

@@ -13,6 +13,7 @@ from markupsafe import Markup
 
 from livedeform.campaign.row import Row
 from livedeform.report.page import Tile, write_page
+from livedeform.report.text import EARLIEST_NS
 
 PAGE = "index.html"
 # name in the row, heading, kind: text, mm (from m), percent, time
@@ -55,7 +56,10 @@ def write_campaign_page(
         count[f"verdict {row['verdict']}"] += 1
         cells.append(json.dumps(_cells(row), ensure_ascii=False, separators=(",", ":")))
     head = json.dumps([{"name": name, "heading": heading, "kind": kind} for name, heading, kind in COLUMNS])
-    data = f'{{"columns":{head},"rows":[{",".join(cells)}]}}'.replace("<", "\\u003c")  # no text is markup
+    earliest = EARLIEST_NS * SCALE["time"]
+    data = f'{{"columns":{head},"earliest":{earliest:g},"rows":[{",".join(cells)}]}}'.replace(
+        "<", "\\u003c"
+    )  # no text is markup
     return write_page(
         out / PAGE,
         "campaign.html.j2",

@@ -15,7 +15,7 @@ from pydantic import BeforeValidator, Field, ValidationError
 from livedeform.closed_loop.candidates import check_known
 from livedeform.common.errors import InputError
 from livedeform.common.experiment.mistakes import IN_WORDS, first_mistake, in_words, locate
-from livedeform.common.experiment.schema import Section, problem
+from livedeform.common.experiment.schema import Section, not_bool
 from livedeform.common.experiment.yaml_file import FILE_NAME
 from livedeform.common.yaml_text import parse_settings
 from livedeform.outputs import CONFIGURATION
@@ -25,13 +25,7 @@ BAG_FILES = (".mcap", ".db3")
 RESULT = "metrics.json"  # marks the folder of a run, whose experiment.yaml is a copy
 
 
-def _whole(value: Any) -> Any:
-    if isinstance(value, bool):
-        raise problem(f"{str(value).lower()!r} is not a number", "write a whole number")
-    return value
-
-
-Whole = Annotated[int, BeforeValidator(_whole)]
+Whole = Annotated[int, BeforeValidator(not_bool)]
 
 
 class RecordingsOf(Section):

@@ -254,9 +254,7 @@ class EffectInfo:
         """Return the value of a parameter, a number or a list, as text, with one sigma where it has one, and its
         unit."""
         values = np.asarray(value, float)
-        sigmas = (
-            np.full(values.shape, np.nan) if sigma is None else np.broadcast_to(np.asarray(sigma, float), values.shape)
-        )
+        sigmas = np.broadcast_to(np.nan if sigma is None else np.asarray(sigma, float), values.shape)
         pairs = zip(values.ravel(), sigmas.ravel(), strict=True)
         parts = [
             f"{v:.{significant(abs(v), s, 4)}g} ± {s:.2g}" if np.isfinite(s) and s > 0.0 else f"{v:.4g}"

@@ -173,6 +173,10 @@ def _sentence(*parts: str) -> str:
 
 def _mm(value: float) -> str:
     """Say a length in mm; one that two decimals would show as next to nothing has two digits."""
-    size = abs(value) * 1e3
-    small = 0.0 < size < SMALL
-    return f"{value * 1e3:.{min(1 - int(np.floor(np.log10(size))), 6)}f}" if small else f"{value * 1e3:.2f}"
+    return f"{value * 1e3:.{decimals(value) if abs(value) * 1e3 < SMALL else 2}f}"
+
+
+def decimals(*values: float, least: int = 2, most: int = 6) -> int:
+    """Return how many decimals (mm) lengths in m need, so that the smallest but zero has two significant ones."""
+    sizes = [abs(v) * 1e3 for v in values if np.isfinite(v) and v != 0.0]
+    return int(np.clip(1 - np.floor(np.log10(min(sizes))), least, most)) if sizes else least

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from livedeform.compare_node.judgement import decimals
 from livedeform.compare_node.metrics import Statistic, rmse
 from livedeform.compare_node.takes import Takes
 from livedeform.comparing.runs import ComparedRun, Difference, MarkerDifference
@@ -16,7 +17,7 @@ from livedeform.comparing.takes import groups, sharing
 from livedeform.outputs import write_json
 from livedeform.report import plots
 from livedeform.report.page import Chart, Table, Tile, Verdict, write_page
-from livedeform.report.text import MM, decimals, interval, mm
+from livedeform.report.text import MM, interval, mm
 
 COLOURS = (plots.BLUE, plots.ORANGE, plots.GREEN, plots.VERMILLION, plots.SKY, "#CC79A7", plots.GREY)
 HEADER = ("run", "recording", "verdict", "errors", "frames", "rmse (mm)", "95 % interval (mm)", "mean (mm)",

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -28,16 +26,17 @@ from livedeform.compare_node.residual import Residual
 from livedeform.comparing.identity import digest_of, is_part
 from livedeform.comparing.takes import Take, read_take
 from livedeform.outputs import RECORDING
-from livedeform.report.run.read import residuals_of
+from livedeform.report.run.read import read_metrics, residuals_of
 
 FEWEST = 3  # frames of a marker for a difference
+OF_TORN = "run it again, or move the file away to compare without it"
 
 
 @dataclass(frozen=True)
 class ComparedRun:
     """One run: its ``name`` among the others, the verdict and the recording's name as its own results have them, and
-    its errors; ``take``: what it says as one take of several, None where its results are not beside it; ``source``
-    tells its recording from others, empty where that is not known."""
+    its errors; ``take``: what it says as one take of several, None where its results are not beside it: then the
+    ``digest`` of its recording, empty where that is not known."""
 
     name: str
     path: Path
@@ -47,7 +46,12 @@ class ComparedRun:
     metrics: RunMetrics
     start_ns: int
     take: Take | None = None
-    source: str = ""
+    digest: str = ""
+
+    @property
+    def source(self) -> str:
+        """Return what tells its recording from others; empty where that is not known."""
+        return self.digest if self.take is None else self.take.source
 
 
 @dataclass(frozen=True)
@@ -100,30 +104,20 @@ def _load(path: Path, name: str) -> ComparedRun:
     residuals = tuple(r for r in residuals_of(recording) if len(r.ids))
     if not residuals:
         raise InputError("holds no errors of a model", where=str(path), remedy="make it with livedeform run")
-    document = _results(bag.parent / "metrics.json")
+    file = bag.parent / "metrics.json"
+    document = read_metrics(file, OF_TORN) if file.is_file() else {}
     metrics = run_metrics(residuals, float(document.get("threshold") or np.inf))
     experiment = bag.parent / FILE_NAME
     if experiment.is_file():
         metrics = with_places(metrics, residuals, load_experiment(experiment, geometry=False).markers)
     verdict = str(document.get("verdict", "not judged"))
     take = read_take(path, name) if document else None
-    source = take.source if take is not None else _source_of(bag)
+    digest = _digest_of(bag) if take is None else ""
     ran = str(document.get("bag", ""))
-    return ComparedRun(name, path, verdict, ran, residuals, metrics, recording.start_ns, take, source)
+    return ComparedRun(name, path, verdict, ran, residuals, metrics, recording.start_ns, take, digest)
 
 
-def _results(file: Path) -> dict[str, Any]:
-    """Read what a run says of itself; nothing where that is not beside it, ``InputError`` where it is torn."""
-    if not file.is_file():
-        return {}
-    try:
-        return dict(json.loads(file.read_text()))
-    except (OSError, ValueError, TypeError) as error:
-        remedy = "run it again, or move the file away to compare without it"
-        raise InputError("is not what livedeform run wrote", where=str(file), remedy=remedy) from error
-
-
-def _source_of(bag: Path) -> str:
+def _digest_of(bag: Path) -> str:
     """Return what tells a run's recording from others, as its own recording has it; empty where that is of a part."""
     with read_bag(bag) as recorded:
         return "" if is_part(recorded.metadata) else digest_of(recorded)
@@ -132,8 +126,7 @@ def _source_of(bag: Path) -> str:
 def compared(reference: ComparedRun, other: ComparedRun) -> Difference | None:
     """The difference other - reference over common stamps and markers; None where there are none in common, or where
     they ran other recordings, whose stamps may be alike."""
-    sources = [run.source or (run.take.source if run.take is not None else "") for run in (reference, other)]
-    if all(sources) and sources[0] != sources[1]:
+    if reference.source and other.source and reference.source != other.source:
         return None
     pairs = _pairs(reference.residuals, other.residuals)
     if not pairs:

@@ -30,12 +30,6 @@ def interval(statistic: Statistic, digits: int = 2) -> str:
     return f"95 % interval, this recording: {mm(statistic.low, digits)} to {mm(statistic.high, digits)}"
 
 
-def decimals(*values: float, least: int = 2, most: int = 6) -> int:
-    """Return how many decimals (mm) lengths in m need, so that the smallest but zero has two significant ones."""
-    sizes = [abs(v) * MM for v in values if np.isfinite(v) and v != 0.0]
-    return int(np.clip(1 - np.floor(np.log10(min(sizes))), least, most)) if sizes else least
-
-
 def less(share: float) -> str:
     """Return by how much an error has become less, or more, as text; a dash where that is not known."""
     if not np.isfinite(share):

@@ -87,7 +87,7 @@ class LiveScene:
         message = decode(raw)
         p, q = message.pose.position, message.pose.orientation
         pose = unit_pose(header_stamp_ns(raw) or 0, (p.x, p.y, p.z), (q.x, q.y, q.z, q.w))
-        yield from _written(lambda w: w.transforms({(t.FRAME_PHANTOM, t.FRAME_PROBE): pose}, pose.stamp_ns, t.TF))
+        yield from written(lambda w: w.transforms({(t.FRAME_PHANTOM, t.FRAME_PROBE): pose}, pose.stamp_ns, t.TF))
         if self._probe is not None and self._due(t.SCENE_PROBE, pose.stamp_ns):
             yield t.SCENE_PROBE, t.MARKER, encode(self._probe_marker(self._probe, pose))
 
@@ -163,7 +163,7 @@ class LiveScene:
         self._said.add(topic)
         camera = self._rig.left if side == "left" else self._rig.right
         stamp_ns = header_stamp_ns(raw) or 0
-        yield from _written(lambda w: w.camera_info(camera, stamp_ns, topic, frame))
+        yield from written(lambda w: w.camera_info(camera, stamp_ns, topic, frame))
 
 
 def _declared_rig(experiment: Experiment) -> StereoRig | None:
@@ -184,8 +184,8 @@ class _Sink:
         self.messages.append((topic, type_name, data))
 
 
-def _written(write: Callable[[RecordingWriter], None]) -> list[Derived]:
-    """The messages that ``write`` makes."""
+def written(write: Callable[[RecordingWriter], None]) -> list[Derived]:
+    """Return the messages that ``write`` makes."""
     sink = _Sink()
     write(RecordingWriter(sink))
     return sink.messages

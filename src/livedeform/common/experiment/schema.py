@@ -65,7 +65,8 @@ def did_you_mean(word: str, known: Sequence[str]) -> str:
 # --- the kinds of values ---------------------------------------------------------------------------------------------
 
 
-def _not_bool(value: Any) -> Any:
+def not_bool(value: Any) -> Any:
+    """Return a value; a mistake if it is true or false, which Python takes for 1 and 0."""
     if isinstance(value, bool):
         raise problem(f"'{str(value).lower()}' is not a number", "write a number")
     return value
@@ -124,7 +125,7 @@ def as_number(value: Any) -> Any:
     return int(value) if whole else float(value)
 
 
-Number = Annotated[float, BeforeValidator(_not_bool), AllowInfNan(False)]
+Number = Annotated[float, BeforeValidator(not_bool), AllowInfNan(False)]
 Positive = Annotated[Number, Field(gt=0)]
 NonNegative = Annotated[Number, Field(ge=0)]
 Length = Annotated[Positive, _between(1e-6, 3.0, "lengths are in metres: 6 mm is 0.006")]

@@ -175,11 +175,12 @@ def _steps(steps: Sequence[SelectionStep]) -> list[str]:
     """Return what each step did, and why; by chance alone, where it has a screening of its own."""
     said, last = [], None
     for step in steps:
-        what = f"added {words(step.added)}: " if step.added else "" if step.screening is last else "nothing added: "
-        n, p = len(step.screening.scores), step.screening.family_p
-        by_chance = "" if step.screening is last else f"; chance alone: {chance(p)} over {n} candidates"
-        said.append(f"{what}{step.reason}{by_chance}")
-        last = step.screening
+        text = f"added {words(step.added)}: {step.reason}" if step.added else step.reason
+        if step.screening is not last:
+            last = step.screening
+            text = text if step.added else f"nothing added: {text}"
+            text += f"; chance alone: {chance(last.family_p)} over {len(last.scores)} candidates"
+        said.append(text)
     return said
 
 

@@ -13,6 +13,7 @@ from livedeform.closed_loop.assessment.verdict import EVIDENCE, headline, share_
 from livedeform.closed_loop.diagnosis import Diagnosis
 from livedeform.closed_loop.write import as_json
 from livedeform.common.experiment.schema import Experiment
+from livedeform.compare_node.judgement import decimals
 from livedeform.report.diagnosis.charts import on_surface_chart, over_time_chart, per_marker_chart, ranking_chart
 from livedeform.report.diagnosis.collect import evidence_of
 from livedeform.report.diagnosis.evidence import DiagnosisEvidence
@@ -24,7 +25,7 @@ from livedeform.report.diagnosis.tables import (
     rivals_in,
 )
 from livedeform.report.page import Table, Tile, Verdict, write_page
-from livedeform.report.text import decimals, less, less_between, mm, words
+from livedeform.report.text import less, less_between, mm, words
 
 
 def write_report(out: Path, result: Diagnosis, experiment: Experiment) -> Path:

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from livedeform.common.experiment.schema import Experiment
-from livedeform.compare_node.judgement import judge
+from livedeform.compare_node.judgement import decimals, judge
 from livedeform.compare_node.metrics import Level, RunMetrics, rmse, run_metrics
 from livedeform.compare_node.residual import Residual
 from livedeform.report.page import Table, Tile, Verdict, write_page
@@ -25,7 +25,7 @@ from livedeform.report.run.evidence import RunEvidence
 from livedeform.report.run.moments import interesting_moments
 from livedeform.report.run.read import load_evidence
 from livedeform.report.run.summary import RunSummary
-from livedeform.report.text import date, decimals, interval, mm
+from livedeform.report.text import date, interval, mm
 
 N_WORST = 5
 

@@ -32,6 +32,7 @@ from livedeform.report.run.evidence import RunEvidence, SurfaceMesh
 from livedeform.stereo_node.camera.setup import rig_of
 
 MOST_ON_PAGE = 30  # moments of the playback: the page stays small
+OF_TORN = "run it again: its recording alone does not say what was counted"
 MAX_PICTURE_GAP_NS = 100_000_000  # a picture further away does not show the moment
 
 ABSOLUTE = re.compile(r"(?<![\w/:.])(?:/[^/\s'\",:;<>()\[\]{}]+){2,}/?")
@@ -41,7 +42,7 @@ def load_evidence(run_dir: Path, experiment: Experiment) -> RunEvidence:
     """Everything that the page shows of a run."""
     bag = run_dir / "run.mcap"
     recording = load_recording(bag, experiment)
-    document = _read_metrics(run_dir / "metrics.json")
+    document = read_metrics(run_dir / "metrics.json", OF_TORN)
     long, short = _by_length(recording.metadata)
     residuals = residuals_of(recording)
     metrics = replace(
@@ -71,12 +72,11 @@ def load_evidence(run_dir: Path, experiment: Experiment) -> RunEvidence:
     )
 
 
-def _read_metrics(file: Path) -> dict[str, Any]:
-    """Read what a run says of itself; ``InputError`` where that is torn."""
+def read_metrics(file: Path, remedy: str) -> dict[str, Any]:
+    """Read what a run says of itself; ``InputError`` with a ``remedy`` where that is torn."""
     try:
         return dict(json.loads(file.read_text()))
-    except (ValueError, TypeError) as error:
-        remedy = "run it again: its recording alone does not say what was counted"
+    except (OSError, ValueError, TypeError) as error:
         raise InputError("is not what livedeform run wrote", where=str(file), remedy=remedy) from error
 
 

@@ -1,5 +1,5 @@
 (() => {
-  const { columns, rows } = JSON.parse(document.getElementById("campaign-data").textContent);
+  const { columns, earliest, rows } = JSON.parse(document.getElementById("campaign-data").textContent);
   const at = Object.fromEntries(columns.map((c, i) => [c.name, i])), KEY = columns.length, LINKS = KEY + 1;
   const WIDTH = { recording: 190, phantom: 120, rig: 80, status: 80, run_verdict: 80, verdict: 120, coverage: 105, error_before_m: 105, effects: 420, rivals: 150, problem: 240 };
   const width = c => WIDTH[c.name] ?? (c.kind === "time" ? 150 : 95);
@@ -8,8 +8,7 @@
   const REPORTS = { run_verdict: [1, "run"], verdict: [2, "diagnosis"] };  // bit of the row's links, and the folder
   const tone = row => row[at.status] === "failed" || row[at.run_verdict] === "ERROR" ? "bad"
     : row[at.verdict] === "none" || (row[at.verdict] === "" && row[at.run_verdict] === "OK") ? "good" : "warn";
-  const EARLIEST = 1e8;  // s, March 1973: a clock that shows less was never set
-  const time = s => s === "" ? "" : s < EARLIEST ? "clock not set" : new Date(1000 * s).toISOString().replace("T", " ").slice(0, 19);
+  const time = s => s === "" ? "" : s < earliest ? "clock not set" : new Date(1000 * s).toISOString().replace("T", " ").slice(0, 19);
   const make = (tag, name, text = "") => { const e = document.createElement(tag); e.className = name; e.textContent = text; return e; };
 
   // what is shown: row numbers, filtered and sorted
@@ -128,7 +127,7 @@
   function paintStrip(canvas) {
     const w = canvas.width = canvas.clientWidth, h = canvas.height = 42, g = canvas.getContext("2d");
     const times = canvas.members.map(i => rows[i][at.started_ns]), low = Math.min(...times), span = Math.max(...times) - low;
-    const spread = low < EARLIEST || span === 0, n = times.length;
+    const spread = low < earliest || span === 0, n = times.length;
     const along = k => spread ? (k + 0.5) / n : (times[k] - low) / span;
     const error = i => rows[i][at.error_before_m] || rows[i][at.rmse_m] || 0, top = Math.max(...canvas.members.map(error)) || 1;
     canvas.places = canvas.members.map((i, k) => [10 + (w - 20) * along(k), h - 6 - (h - 14) * error(i) / top]);

@@ -25,6 +25,7 @@ from livedeform.common.experiment.schema import (
     Vector,
     check_curve,
     did_you_mean,
+    not_bool,
     problem,
 )
 from livedeform.common.frames import MAKE_A_FRAME
@@ -46,12 +47,6 @@ def _whole(value: Any) -> Any:
     return value
 
 
-def _not_bool(value: Any) -> Any:
-    if isinstance(value, bool):
-        raise problem(f"'{str(value).lower()}' is not a number", "write a number")
-    return value
-
-
 def _plain_name(name: str) -> str:
     if not name or name.startswith(".") or len(name.encode()) > LONGEST_NAME or NOT_IN_NAMES.search(name):
         raise problem(f"'{name}' is no name for a recording", "give a plain name of a folder, as a or take-01")
@@ -63,7 +58,7 @@ def _or_none(value: Any) -> Any:
 
 
 Count = Annotated[int, BeforeValidator(_whole), Field(ge=1, le=10_000)]
-Few = Annotated[int, BeforeValidator(_not_bool), Field(ge=0)]
+Few = Annotated[int, BeforeValidator(not_bool), Field(ge=0)]
 Share = Annotated[Number, Field(ge=0.0, lt=1.0)]
 Rate = Annotated[Positive, Field(le=MOST_HZ)]
 Place = tuple[Number, Number]
@@ -229,7 +224,7 @@ class OnePress(Part):
 class Scenario(Part):
     """A scenario with its defaults filled in."""
 
-    version: Annotated[Literal[1], BeforeValidator(_not_bool)]
+    version: Annotated[Literal[1], BeforeValidator(not_bool)]
     name: Name
     body: Annotated[Block | HemiEllipsoid | BentSlab, Field(discriminator="shape")]
     declared: Declared
