@@ -21,6 +21,7 @@ EFFECTS = (
     EffectValues("skin", {"thickness": np.array(0.004), "ratio": np.array(2.0)}),
 )
 RUBS = EffectValues("probe_friction", {"mu": np.array(0.3)})
+PRESSED = 0.3  # of the way to the deepest pose: the probe touches, which is all that a kernel needs
 
 
 def compile_kernels() -> None:
@@ -29,10 +30,11 @@ def compile_kernels() -> None:
     experiment = load_experiment(folder / "experiment")
     recording = load_recording(folder / "bags" / "a", experiment)
     first = recording.poses[0]
-    deep = max(recording.poses, key=lambda pose: float(np.linalg.norm(pose.position - first.position)))
+    away = np.array([np.linalg.norm(pose.position - first.position) for pose in recording.poses])
+    pressed = recording.poses[int(np.argmax(away > PRESSED * away.max()))]
     for effects in ((), EFFECTS, (RUBS,)):
         model = PhantomModel.from_experiment(experiment, effects=effects)
         rest = model.predict(first).markers
-        model.predict(deep)
+        model.predict(pressed)
     tracker = StereoTracker.from_experiment(experiment, None, rest)
     tracker.process(next(recording.left), next(recording.right))

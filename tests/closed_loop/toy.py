@@ -4,7 +4,7 @@ elements."""
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.signal import lfilter
@@ -17,6 +17,7 @@ from livedeform.closed_loop.forward import Column, Run
 from livedeform.closed_loop.inference.fitted_model import Uncertain
 from livedeform.closed_loop.settings import Settings
 from livedeform.common.effect import Surroundings
+from livedeform.common.frames import PosePath
 from livedeform.common.published_effects import with_others
 from livedeform.common.types import Array, EffectValues, MarkerFrame, Pose
 from livedeform.fem_node.physics.record import Physics, Probe, Support, TemperatureCurve
@@ -157,11 +158,14 @@ class ToyModel:
     body: ToyBody
     processes: int = 1
     declared: Sequence[EffectValues] = ()
+    paths: dict[int, tuple[Observation, PosePath]] = field(default_factory=dict)  # by the observation's id
 
     def predict(self, effects: Sequence[EffectValues], observation: Observation) -> Array:
         effects = with_others(self.declared, effects)
         offset = next((float(e.values["seconds"]) for e in effects if e.name == "time_offset"), 0.0)
-        position, _ = poses_at(observation.path, observation.stamps_ns, offset)
+        if id(observation) not in self.paths:
+            self.paths[id(observation)] = observation, PosePath(observation.path)
+        position, _ = self.paths[id(observation)][1].at(observation.stamps_ns, offset)
         return self.body.points(effects, observation.seconds, position)
 
     def run(

@@ -40,7 +40,9 @@ def stream(talk: Conversation, messages: list[RawMessage], log: Path) -> None:
     talk.wait("error of the model", said)
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM], ids=["ctrl-c", "sigterm"])
+@pytest.mark.parametrize(
+    "number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)], ids=["ctrl-c", "sigterm"]
+)
 def test_it_waits_records_and_ends_cleanly(number: int, experiment: Path, bag: Path, tmp_path: Path):
     log, out = tmp_path / "live.log", tmp_path / "out"
     with (

@@ -77,7 +77,7 @@ def test_points_of_other_things_do_not_move_it():
     assert np.abs(off(pose, T)[3:]).max() < 5e-5 and 0.8 < pose.share < 0.9
 
 
-@pytest.mark.parametrize("wave_number", [0.0, 120.0, 250.0])
+@pytest.mark.parametrize("wave_number", [0.0, pytest.param(120.0, marks=pytest.mark.slow), 250.0])
 def test_the_uncertainty_is_as_large_as_the_errors(wave_number: float):
     """Chi-square of six numbers in 20 takes, of noise alone, and of shape errors with waves of some centimetres, which
     make few of many points."""

@@ -44,7 +44,7 @@ def test_a_plate_bears_its_strength_over_all_that_it_covers_and_then_lets_go() -
     assert not body.memory.contact.glued.any()
 
 
-@pytest.mark.parametrize("friction", [0.0, 0.2])
+@pytest.mark.parametrize("friction", [0.0, pytest.param(0.2, marks=pytest.mark.slow)])
 def test_a_ball_pulls_the_same_however_exactly_its_contact_is_solved_on_the_way(friction: float) -> None:
     """Measured 1.1 % of the press's force, and 0.4 % of the pull's, for gaps solved to 20 and to 2.5 um."""
     one, other = (pulls(under(BALL, (6, 5, 2), nu=0.45, friction=friction), 5e-4, exact=exact) for exact in (1.0, 8.0))
@@ -60,7 +60,9 @@ def test_a_ball_pulls_the_same_in_smaller_steps() -> None:
     assert np.abs(one - other).max() < 0.001 * one.max()
 
 
-@pytest.mark.parametrize("strength", [500.0, 1500.0, pytest.param(4000.0, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "strength", [500.0, pytest.param(1500.0, marks=pytest.mark.slow), pytest.param(4000.0, marks=pytest.mark.slow)]
+)
 def test_a_ball_pulls_by_what_its_work_of_separation_asks_for(strength: float) -> None:
     """Johnson, Kendall & Roberts 1971. Measured 0.83, 0.95 and 0.80 times as much with elements of 10 mm: asked is
     within 0.3."""

@@ -76,6 +76,7 @@ def test_a_plate_that_turns_back_takes_up_the_whole_slope_before_it_slides_back(
     assert np.linalg.norm(moved[:, :2], axis=1).max() < 1e-5
 
 
+@pytest.mark.slow
 def test_a_press_and_a_stroke_say_the_same_in_smaller_steps() -> None:
     found = []
     for move in (5e-4, 2.5e-4, 1.25e-4):

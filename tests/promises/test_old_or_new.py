@@ -54,7 +54,7 @@ def judge(found: list[dict[str, Any]], there: str) -> None:
         assert len([a for a in found if a["fault"] == fault and a["code"] not in (0, 1)]) >= 5
 
 
-@pytest.mark.parametrize("there", ["old", "nothing"])
+@pytest.mark.parametrize("there", ["old", pytest.param("nothing", marks=pytest.mark.slow)])
 def test_every_write_fails_once(there: str, tmp_path: Path):
     out = tmp_path / "work" / "out"
     if there == "old":

@@ -65,7 +65,7 @@ def normal_equations_of(selection: Selection) -> dict[str, Any]:
         added = list(own)
     stacked = np.column_stack([kept.columns for kept in chosen.values()])
     ridge = normal_equations(problem.marginal(), problem.residual, stacked)
-    return _document(ridge, chosen, added) | _shapes(chosen)
+    return _document(ridge, problem.rows.n, chosen, added) | _shapes(chosen)
 
 
 def _is_about_the_fit(selection: Selection, fit: Fit, first: Linearised, last: Linearised) -> bool:
@@ -112,8 +112,8 @@ def _tried(step: Linearised, candidates: Mapping[str, Candidate]) -> dict[str, C
     return {name: c for name, c in candidates.items() if name in names}
 
 
-def _document(ridge: Ridge, chosen: Mapping[str, KeptEffect], added: list[str]) -> dict[str, Any]:
-    """Put the arrays together; an effect that is switched as a whole has one column without a parameter."""
+def _document(ridge: Ridge, n: int, chosen: Mapping[str, KeptEffect], added: list[str]) -> dict[str, Any]:
+    """Put the arrays of ``n`` data together; an effect that is switched as a whole has a column without a parameter."""
     labels: list[tuple[str, str, int, float, str, float, bool]] = []
     for name, kept in chosen.items():
         amplitudes = [kept.candidate.coordinates[int(i)] for i in kept.candidate.strengths]
@@ -123,7 +123,7 @@ def _document(ridge: Ridge, chosen: Mapping[str, KeptEffect], added: list[str]) 
             labels.append((name, "", -1, 1.0, "linear", 0.0, name in added))
     effect, parameter, index, sigma, transform, neutral, fitted = (np.array(v) for v in zip(*labels, strict=True))
     return {
-        "version": 1, "G": ridge.G, "b": ridge.b, "c": ridge.c, "n": ridge.n, "effect": effect, "parameter": parameter,
+        "version": 1, "G": ridge.G, "b": ridge.b, "c": ridge.c, "n": n, "effect": effect, "parameter": parameter,
         "index": index, "sigma": sigma, "transform": transform, "neutral": neutral, "fitted": fitted,
     }  # fmt: skip
 

@@ -473,6 +473,7 @@ class BaselineSettings:
     )
     ratios: tuple[float, ...] = _effort((0.1, 0.3, 1.0, 3.0), "1", "of the discrepancy's size to the noise's")
     most: int = _effort(1500, "1", "data of the Gaussian process")
+    chosen_by: int = _effort(600, "1", "of these, by which its length and size are chosen")
 
 
 @dataclass(frozen=True)

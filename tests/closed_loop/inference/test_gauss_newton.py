@@ -79,7 +79,7 @@ def test_where_all_rows_are_left_out_the_prior_stands():
     nothing = Marginal(C, Z, np.zeros(rows.n, bool))
     ridge = normal_equations(nothing, rng.normal(size=rows.n), rng.normal(size=(rows.n, 2)))
     s = ridge.solve(np.array([2.0, 3.0]), np.full(2, -9.0), np.full(2, 9.0))
-    assert ridge.n == 0 and s.theta.tolist() == [0.0, 0.0]
+    assert s.theta.tolist() == [0.0, 0.0]
     assert s.covariance == pytest.approx(np.diag([4.0, 9.0])) and s.evidence == pytest.approx(0.0)
 
 
@@ -150,7 +150,7 @@ def test_a_touch_that_comes_late_is_no_residual():
 
 def test_bounds_hold():
     G = np.array([[2.0, 0.5], [0.5, 1.0]])
-    s = Ridge(G, np.array([-1.0, 1.0]), 1.0, 10).solve(np.full(2, 1e3), np.array([0.0, -9.0]), np.array([9.0, 9.0]))
+    s = Ridge(G, np.array([-1.0, 1.0]), 1.0).solve(np.full(2, 1e3), np.array([0.0, -9.0]), np.array([9.0, 9.0]))
     assert s.theta == pytest.approx([0.0, 1.0], rel=1e-4)
     assert s.at_bound.tolist() == [True, False]
 

@@ -157,7 +157,12 @@ def soft_column() -> tuple[Setting, Observation]:
 
 
 @pytest.mark.parametrize(
-    ("name", "k", "step"), [("stiffness", 0, 0.1), ("gravity_tilt", 0, 0.02), ("probe_offset", 2, 2e-4)]
+    ("name", "k", "step"),
+    [
+        pytest.param("stiffness", 0, 0.1, marks=pytest.mark.slow),
+        ("gravity_tilt", 0, 0.02),
+        pytest.param("probe_offset", 2, 2e-4, marks=pytest.mark.slow),
+    ],
 )
 def test_columns_are_those_of_whole_runs_where_only_friction_keeps_a_soft_body_upright(
     name: str, k: int, step: float

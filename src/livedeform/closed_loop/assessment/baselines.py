@@ -125,23 +125,29 @@ def process_discrepancy(
     process with a squared-exponential kernel, its length and size by the marginal likelihood."""
     good = np.isfinite(residual).all(axis=1) & np.isfinite(known).all(axis=1)
     known, residual = known[good], residual[good]
-    if len(known) > settings.most:
-        pick = np.random.default_rng(seed).choice(len(known), settings.most, replace=False)
-        known, residual = known[pick], residual[pick]
+    pick = np.random.default_rng(seed).permutation(len(known))[: settings.most]
+    known, residual = known[pick], residual[pick]
     spread = np.maximum(known.std(axis=0), 1e-9)
     a, b = known / spread, wanted / spread
     noise = float(np.median(np.abs(residual))) / MAD_PER_SIGMA
-    best, mean = -np.inf, np.zeros((len(wanted), 3))
+    length, size = _by_evidence(a[: settings.chosen_by], residual[: settings.chosen_by], noise, settings)
+    factor = cho_factor(size * _kernel(a, a, length) + noise**2 * np.eye(len(a)), overwrite_a=True)
+    return np.asarray(size * _kernel(b, a, length) @ cho_solve(factor, residual))
+
+
+def _by_evidence(known: Array, residual: Array, noise: float, settings: BaselineSettings) -> tuple[float, float]:
+    """Choose the length and the variance m2 of the process by its marginal likelihood."""
+    best, chosen = -np.inf, (settings.lengths[0], 0.0)
     for length in settings.lengths:
-        K, Kw = _kernel(a, a, length), _kernel(b, a, length)
+        K = _kernel(known, known, length)
         for ratio in settings.ratios:
             size = (ratio * noise) ** 2
-            factor = cho_factor(size * K + noise**2 * np.eye(len(a)))
-            alpha = cho_solve(factor, residual)
-            evidence = -0.5 * float(np.sum(residual * alpha)) - 3.0 * float(np.log(np.diag(factor[0])).sum())
+            factor = cho_factor(size * K + noise**2 * np.eye(len(known)), overwrite_a=True)
+            fits = float(np.sum(residual * cho_solve(factor, residual)))
+            evidence = -0.5 * fits - 3.0 * float(np.log(np.diag(factor[0])).sum())
             if evidence > best:
-                best, mean = evidence, size * Kw @ alpha
-    return mean
+                best, chosen = evidence, (length, size)
+    return chosen
 
 
 def process_inputs(points: Array, places: Array) -> Array:

@@ -96,14 +96,10 @@ class Power:
     ) -> dict[str, Detectable]:
         """Find it for all ``candidates``, whose columns are those of the ``dictionary`` (n, P); ``family``: how many
         would be looked for (None: these)."""
-        marginal = problem.marginal()
-        full = _information(marginal(dictionary))
-        sets = Screening(self.settings.screening).training_sets(problem)
-        parts = [_information(problem.marginal(keep)(dictionary)) for keep in sets]
-        n_time = len(np.unique(problem.rows.fold))
+        products = Screening(self.settings.screening).products(problem, dictionary)
         moved = _apart_from_registration(problem, dictionary)
         entries, out = entries_of(candidates), {}
-        views, tried = (parts[:n_time], parts[n_time:]), family or len(candidates)
+        full, views, tried = products.whole, (products.time, products.markers), family or len(candidates)
         for candidate in candidates:
             found = [
                 max(
@@ -163,10 +159,6 @@ def _distance(limit: float, p: int, power: float) -> float:
     """Find how far (in sigmas) from zero a normal vector (p,) is if its squared length exceeds the limit with
     the ``power``."""
     return float(brentq(lambda d: 1.0 - chndtr(limit, p, d**2) - power, 1e-3, np.sqrt(limit) + 10.0))
-
-
-def _information(white: Array) -> Array:
-    return np.asarray(white.T @ white)
 
 
 def _cost(full: Array, view: Sequence[Array], entry: DictionaryEntry) -> float:

@@ -76,17 +76,21 @@ class Problem:
 
 @dataclass(frozen=True)
 class Ridge:
-    """Normal equations of Jacobian columns: ``G`` (p, p) = J~^T J~, ``b`` (p,), ``c`` = r~^T r~, of ``n`` data."""
+    """Normal equations of Jacobian columns: ``G`` (p, p) = J~^T J~, ``b`` (p,) = J~^T r~, ``c`` = r~^T r~."""
 
     G: Array
     b: Array
     c: float
-    n: int
+
+    @classmethod
+    def of(cls, products: Array) -> Ridge:
+        """Take them from the ``products`` (p + 1, p + 1) of the columns and, last, the residual."""
+        return cls(products[:-1, :-1], products[:-1, -1], float(products[-1, -1]))
 
     def part(self, columns: Sequence[int] | np.ndarray) -> Ridge:
         """Keep some of the columns."""
         i = np.asarray(columns, int)
-        return Ridge(self.G[np.ix_(i, i)], self.b[i], self.c, self.n)
+        return Ridge(self.G[np.ix_(i, i)], self.b[i], self.c)
 
     def solve(self, sigma: Array, lower: Array, upper: Array) -> LinearFit:
         """Find the MAP with priors of ``sigma`` (p,) about 0 and bounds; see `LinearFit`."""
@@ -112,8 +116,8 @@ class LinearFit:
 
 def normal_equations(marginal: Marginal, residual: Array, columns: Array) -> Ridge:
     """Form the normal equations of raw ``residual`` (n,) and Jacobian ``columns`` (n, p) over all rows."""
-    r, J = marginal(residual), marginal(columns)
-    return Ridge(J.T @ J, J.T @ r, float(r @ r), len(r))
+    both = marginal(np.column_stack([columns, residual]))
+    return Ridge.of(both.T @ both)
 
 
 def bounded_minimum(A: Array, b: Array, lower: Array, upper: Array) -> Array:

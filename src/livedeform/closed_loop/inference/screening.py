@@ -26,12 +26,11 @@ from livedeform.closed_loop.candidates import Candidate, doubt
 from livedeform.closed_loop.inference.gauss_newton import (
     Fit,
     LinearFit,
-    Marginal,
     Prior,
     Problem,
     Ridge,
-    normal_equations,
 )
+from livedeform.closed_loop.inference.training import Products
 from livedeform.closed_loop.settings import ScreeningSettings
 from livedeform.common.types import Array
 
@@ -121,12 +120,11 @@ class Screening:
         names = list(dict.fromkeys(e.name for e in entries))
         if not names:
             return Screened((), 1.0)
-        marginals = [problem.marginal()] + [problem.marginal(keep) for keep in self.training_sets(problem)]
-        ridges = [normal_equations(m, problem.residual, dictionary) for m in marginals]
-        n_time = len(np.unique(problem.rows.fold))
-        rng = np.random.default_rng(seed)
-        draws = marginals[0](noise_draws(problem, rng, self.settings.draws))
-        b_draws = marginals[0](dictionary).T @ draws
+        products = self.products(problem, np.column_stack([dictionary, problem.residual]))
+        ridges = [Ridge.of(product) for product in products.all]
+        n_time, marginal = len(products.time), problem.marginal()
+        draws = marginal(noise_draws(problem, np.random.default_rng(seed), self.settings.draws))
+        b_draws = marginal(dictionary).T @ draws
         scores = [self._score([e for e in entries if e.name == name], ridges, b_draws, n_time) for name in names]
         scores.sort(key=lambda s: s.score)
         return Screened(tuple(scores), family_wise([s.p_value for s in scores]))
@@ -156,29 +154,25 @@ class Screening:
     def cross_validated(self, problem: Problem, fit: Fit, *candidates: Candidate) -> tuple[Views, Array]:
         """Score a nonlinear fit of candidates by its linearisation: its views, and scores of the blocks of time."""
 
-        def evidence(marginal: Marginal) -> float:
-            r0, r, J = marginal(problem.residual), marginal(fit.residual), marginal(fit.columns)
-            A = J.T @ J + np.diag(1.0 / sigma**2)
-            b = J.T @ r - prior.slope(fit.z)
-            _, logdet = np.linalg.slogdet(A * np.outer(sigma, sigma))
-            return float(r0 @ r0 - (r @ r + prior.cost(fit.z) - b @ np.linalg.solve(A, b) + logdet))
+        prior, n = Prior.of(candidates, fit.z), len(fit.z)
+        sigma, slope = 1.0 / np.sqrt(prior.precision(fit.z)), prior.slope(fit.z)
 
-        prior = Prior.of(candidates, fit.z)
-        sigma = 1.0 / np.sqrt(prior.precision(fit.z))
+        def evidence(product: Array) -> float:
+            A = product[:n, :n] + np.diag(1.0 / sigma**2)
+            b = product[:n, n] - slope
+            _, logdet = np.linalg.slogdet(A * np.outer(sigma, sigma))
+            left = product[n, n] + prior.cost(fit.z) - b @ np.linalg.solve(A, b)
+            return float(product[n + 1, n + 1] - left - logdet)
+
+        products = self.products(problem, np.column_stack([fit.columns, fit.residual, problem.residual]))
         stated = np.concatenate([c.stated for c in candidates])
-        full = evidence(problem.marginal())
-        per_set = np.array([evidence(problem.marginal(keep)) - full for keep in self.training_sets(problem)])
-        n_time = len(np.unique(problem.rows.fold))
+        full, *sets = [evidence(product) for product in products.all]
+        per_set, n_time = np.array(sets) - full, len(products.time)
         return views_of(per_set, n_time, doubt(fit.z, stated, self.settings.doubt)), by_time(per_set, n_time)
 
-    def training_sets(self, problem: Problem) -> list[np.ndarray]:
-        """Rows to keep when each block of time is left out, then when each of some interleaved groups of markers is.
-
-        Blocks of time alone do not test what is constant: the markers' places would learn it from the other blocks.
-        """
-        rows, n = problem.rows, self.settings.marker_folds
-        sets = [rows.fold != f for f in np.unique(rows.fold)]
-        return sets + [(rows.marker < 0) | (rows.marker % n != g) for g in range(n)]
+    def products(self, problem: Problem, columns: Array) -> Products:
+        """Form the products of ``columns`` (n, p) over all data and over each training set."""
+        return Products.of(problem, columns, self.settings.marker_folds)
 
 
 def family_wise(p_values: Sequence[float]) -> float:
