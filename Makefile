@@ -14,7 +14,7 @@ PURE_TESTS := tests/common tests/compare_node
 # one thread each: the test workers share the cores
 ONE_THREAD := OMP_NUM_THREADS=1 MKL_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 NUMBA_NUM_THREADS=1
 
-.PHONY: demo docs test test-slow check coverage bench lock blind-test colcon clean
+.PHONY: demo docs test test-slow check types coverage bench lock blind-test colcon clean
 
 demo: $(VENV)/installed ## the main job on the shipped experiment: report in out/demo
 	$(BIN)/livedeform demo --out $(DEMO_OUT) --force
@@ -31,9 +31,11 @@ ifneq ($(LOCK),)
 endif
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	$(BIN)/mypy
+	$(MAKE) --no-print-directory -j 2 types coverage
 	$(MAKE) --no-print-directory test
-	$(MAKE) --no-print-directory coverage
+
+types: $(VENV)/check-installed
+	$(BIN)/mypy
 
 coverage: $(VENV)/installed ## the coverage of the pure layers by their own tests: cheap, unlike a trace of the whole suite
 	$(ONE_THREAD) $(BIN)/python -m pytest -q -m "not slow and not statistical" $(PURE_TESTS) --cov --cov-report=

@@ -54,6 +54,7 @@ def test_sphere_follows_hertz():
     assert np.mean(pressure[inner]) == pytest.approx(np.mean(exact), rel=0.25)
 
 
+@pytest.mark.slow
 def test_flat_punch_follows_sneddon():
     radius, depth = 0.005, 0.0002
     body = pressed(Cylinder(radius, 0.02), depth)

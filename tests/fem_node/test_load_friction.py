@@ -57,6 +57,7 @@ def test_without_friction_nothing_changes():
     assert not memory_of(rubbing(0.0)).slips and memory_of(rubbing(0.1)).slips
 
 
+@pytest.mark.slow
 def test_each_half_period_loses_as_much():
     """2 F / k, whatever the swing (Coulomb; Den Hartog 1931); what the steps of time lose besides is taken off."""
     ratio = 0.05

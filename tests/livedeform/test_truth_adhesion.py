@@ -44,7 +44,8 @@ def test_a_plate_bears_its_strength_over_all_that_it_covers_and_then_lets_go() -
     assert not body.memory.contact.glued.any()
 
 
-@pytest.mark.parametrize("friction", [0.0, pytest.param(0.2, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("friction", [0.0, 0.2])
 def test_a_ball_pulls_the_same_however_exactly_its_contact_is_solved_on_the_way(friction: float) -> None:
     """Measured 1.1 % of the press's force, and 0.4 % of the pull's, for gaps solved to 20 and to 2.5 um."""
     one, other = (pulls(under(BALL, (6, 5, 2), nu=0.45, friction=friction), 5e-4, exact=exact) for exact in (1.0, 8.0))
@@ -54,6 +55,7 @@ def test_a_ball_pulls_the_same_however_exactly_its_contact_is_solved_on_the_way(
     assert np.abs(one - other)[pulling].max() < 0.01 * other.max()
 
 
+@pytest.mark.slow
 def test_a_ball_pulls_the_same_in_smaller_steps() -> None:
     one, other = pulls(under(BALL, (6, 5, 2), nu=0.45), 5e-4), pulls(under(BALL, (6, 5, 2), nu=0.45), 2.5e-4)[::2]
     assert one.max() > 0.0

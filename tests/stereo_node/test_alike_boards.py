@@ -100,6 +100,7 @@ def circles(n: int, turned: int | None) -> tuple[Board, list[Pair]]:
     return board, pairs
 
 
+@pytest.mark.slow
 def test_an_outlier_does_not_bend_the_middles_of_the_others():
     """They are taken anew without it: the baseline came out 529 mm too long."""
     board, pairs = circles(14, turned=3)

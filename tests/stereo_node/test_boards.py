@@ -151,6 +151,7 @@ def _nearly_parallel(rig, board, n=8, sigma=0.05, tilt=0.08, seed=3, distance=0.
     return pairs
 
 
+@pytest.mark.slow
 def test_what_a_lens_model_leaves_out_is_in_the_focal_lengths_interval():
     """Weak boards tell little of k2, p1 and p2. Fixed at zero, the interval held fx in 14 of these 16 cases, and in 17
     of 30 of the benchmark's ``drawn_weak``."""

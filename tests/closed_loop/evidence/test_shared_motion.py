@@ -47,6 +47,7 @@ def peak(n: int) -> float:
     return float(used)
 
 
+@pytest.mark.slow
 def test_a_long_recording_takes_memory_as_its_frames_do() -> None:
     """18 000 frames, 90 s at 200 Hz, needed more than 5 GB."""
     peak(500)

@@ -162,6 +162,7 @@ def block_under(probe: Probe) -> Setting:
     return replace(setting(4, probe=probe), mesh=block_mesh((0.1, 0.1, 0.05), (8, 8, 4)))
 
 
+@pytest.mark.slow
 def test_what_elements_get_wrong_where_the_probe_pulls_is_told_by_one_that_slips():
     """Declared adhesion, or a friction that is an effect, changes nothing of what the refined mesh tells."""
     s = block_under(Probe(make_shape("sphere", 0.03)))
@@ -262,6 +263,7 @@ def test_friction_beside_an_adhesion_that_is_nothing_is_not_told():
     assert anew_by(body, body, o)(effects, [o], lambda: [body.simulate(effects, o, ())], columns) is None
 
 
+@pytest.mark.slow
 def test_what_elements_get_wrong_where_the_probe_rubs_is_told_with_its_friction():
     """All of the difference between two rubbing runs, which is asked for again where an effect is uneven only."""
     s = block_under(Probe(make_shape("sphere", 0.03), friction=0.5))
@@ -282,6 +284,7 @@ def test_what_elements_get_wrong_where_the_probe_rubs_is_told_with_its_friction(
     assert asked == ["inclusion"]
 
 
+@pytest.mark.slow
 def test_where_the_refined_mesh_has_no_answer_a_moment_alike_tells(monkeypatch):
     """The third of four moments, at another place, is lost there: its correction is off by 0.32 of itself, where 0.5 is
     allowed for (``remains``), and it is counted. Where the own mesh has no answer the other one is not asked."""

@@ -191,6 +191,7 @@ def test_columns_where_the_probe_rubs_need_no_fast_solver(monkeypatch) -> None:
     np.testing.assert_allclose(two.d_points, one.d_points, atol=1e-3 * np.abs(one.d_points).max())
 
 
+@pytest.mark.slow
 def test_a_soft_body_stands_elsewhere_without_the_friction_that_keeps_it_upright() -> None:
     """Why nothing is told of it under a probe that slips: measured 0.66 of its motion apart."""
     setting, o = soft_column()
