@@ -31,10 +31,10 @@ ifneq ($(LOCK),)
 endif
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	$(MAKE) --no-print-directory -j 2 types coverage
+	$(MAKE) --no-print-directory -j 2 types coverage # kernels compile beside the check of the types
 	$(MAKE) --no-print-directory test
 
-types: $(VENV)/check-installed
+types: $(VENV)/check-installed ## the types
 	$(BIN)/mypy
 
 coverage: $(VENV)/installed ## the coverage of the pure layers by their own tests: cheap, unlike a trace of the whole suite
@@ -45,7 +45,7 @@ docs: $(VENV)/check-installed ## the documentation as a site in out/site, withou
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 	@echo "out/site/index.html"
 
-$(VENV)/check-installed: $(VENV)/installed $(CHECK_LOCK)
+$(VENV)/check-installed: $(VENV)/packages $(CHECK_LOCK)
 ifeq ($(LOCK),)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[$(EXTRAS),$(CHECK_EXTRAS)]'
 else
@@ -57,7 +57,7 @@ bench: $(VENV)/installed ## the benchmark table
 	$(BIN)/python -m benchmarks
 
 # the source tree is what is tested, so the package is installed in place; a changed pyproject or lock installs again
-$(VENV)/installed: pyproject.toml setup.py $(LOCK)
+$(VENV)/packages: pyproject.toml setup.py $(LOCK)
 	@test -n "$(PYTHON)" || { echo "no Python 3.11 or newer found; name one: make PYTHON=/path/to/python3.11" >&2; exit 2; }
 	$(PYTHON) -m venv $(VENV)
 ifeq ($(LOCK),)
@@ -68,6 +68,9 @@ else
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation -e .
 	$(BIN)/python -m pip --disable-pip-version-check check
 endif
+	@touch $@
+
+$(VENV)/installed: $(VENV)/packages
 	@echo "compiling kernels, once: about a minute"
 	$(BIN)/python -c "from livedeform.kernels import compile_kernels; compile_kernels()"
 	@touch $@

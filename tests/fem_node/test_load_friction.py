@@ -72,6 +72,7 @@ def test_it_rests_where_friction_holds_it():
     assert abs(height[-1]) < 0.2 * FORCE / STIFFNESS
 
 
+@pytest.mark.slow
 def test_it_gives_before_it_slides():
     """A swing much smaller than that meets a spring of F / give, and is shorter."""
     give, ratio = 0.05, 2.0

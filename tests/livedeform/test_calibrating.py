@@ -88,6 +88,7 @@ def words(folder: Path, first: str = "left0[0-6].png", **options: object) -> lis
     return [w for key, v in given.items() if v is not None for w in (f"--{key.replace('_', '-')}", str(v))]
 
 
+@pytest.mark.slow
 def test_from_files_with_a_check_of_the_scale(pictures: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     check = {"check_left": pictures / "left0[789].png", "check_right": pictures / "right0[789].png"}
     out = tmp_path / "out"

@@ -356,6 +356,7 @@ def test_all_moments_are_solved_where_the_deepest_change_much_or_tell_nothing():
     assert not is_small(changed, replace(declared, points={("a", 1): along}), [o], 0.5)
 
 
+@pytest.mark.slow
 def test_the_deepest_moments_tell_what_all_of_them_tell():
     """A stiffer skin at three depths: of all moments and of the deepest the corrections differ by 0.1 um rms of 30."""
     s, _, model, _ = pressed_block()
