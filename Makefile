@@ -31,10 +31,11 @@ ifneq ($(LOCK),)
 endif
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	$(MAKE) --no-print-directory -j 2 types coverage # kernels compile beside the check of the types
+	$(MAKE) --no-print-directory -j 2 types coverage
 	$(MAKE) --no-print-directory test
 
-types: $(VENV)/check-installed ## the types
+# kernels compile beside it in a fresh clone
+types: $(VENV)/check-installed ## the types, by mypy
 	$(BIN)/mypy
 
 coverage: $(VENV)/installed ## the coverage of the pure layers by their own tests: cheap, unlike a trace of the whole suite

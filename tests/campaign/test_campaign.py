@@ -120,8 +120,7 @@ def test_errors_in_the_middle_leave_the_others_done_and_are_done_again_when_aske
     assert (out / "index.html").is_file()
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("left", [0, 100])
+@pytest.mark.parametrize("left", [0, pytest.param(100, marks=pytest.mark.slow)])
 def test_a_torn_row_is_done_again(tmp_path: Path, left: int) -> None:
     """It was "failed" in the table and the page for ever, "0 failed" on the terminal, and the exit code was 0."""
     source, out = lab.write_laboratory(tmp_path / "lab.2026", 1, 2), tmp_path / "out"

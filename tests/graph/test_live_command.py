@@ -66,8 +66,9 @@ def test_it_waits_records_and_ends_cleanly(number: int, experiment: Path, bag: P
     assert "Traceback" not in log.read_text()
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("apart", [0.0, 0.05, 0.5])
+@pytest.mark.parametrize(
+    "apart", [pytest.param(0.0, marks=pytest.mark.slow), 0.05, pytest.param(0.5, marks=pytest.mark.slow)]
+)
 def test_a_second_signal_leaves_out_what_waits_and_not_the_results(
     apart: float, experiment: Path, bag: Path, tmp_path: Path
 ):
