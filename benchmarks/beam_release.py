@@ -78,7 +78,7 @@ def fitted(inputs: Inputs, runs: int, start: str = "") -> FittedModel:
     """Fit all of them together in so many ``runs`` of the whole, roughly first unless a ``start`` is given."""
     model, method = started(inputs, start), method_of(inputs)
     problem = stated(method, model)
-    marginal = problem.marginal()
+    marginal = problem.marginal
     fit = method.fitter.fit(problem, marginal, model, range(len(model.added)), runs, goes_on=bool(start))
     if fit is None:
         raise SystemExit("the model cannot be solved there")
@@ -90,7 +90,7 @@ def fitted(inputs: Inputs, runs: int, start: str = "") -> FittedModel:
 def left_by_axis(problem: Problem) -> Array:
     """Return the chi2 (3,) that is left along x, y and z when all that is uncertain in common is where it leaves
     least."""
-    whitener = problem.covariance.whitener()
+    whitener = problem.covariance.whitener
     Z, r = whitener.whiten(problem.nuisance.columns), whitener.whiten(problem.residual)
     left = r - Z @ np.linalg.solve(np.eye(Z.shape[1]) + Z.T @ Z, Z.T @ r)
     return np.bincount(problem.rows.axis[np.concatenate(whitener.picks)], weights=left**2, minlength=3)

@@ -7,6 +7,7 @@ import re
 import subprocess
 import sys
 from fnmatch import fnmatch
+from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -32,6 +33,7 @@ WITH_NODES = ("run/running.py", "run/playing.py", "demo.py")  # they run or feed
 MODULES = sorted(SRC.glob("**/*.py"))
 
 
+@cache
 def imports(path: Path) -> set[str]:
     """Dotted names of all imports in a file, wherever they stand."""
     names = set()

@@ -64,7 +64,7 @@ def normal_equations_of(selection: Selection) -> dict[str, Any]:
         chosen |= _columns(last, _tried(last, selection.candidates)) | own
         added = list(own)
     stacked = np.column_stack([kept.columns for kept in chosen.values()])
-    ridge = normal_equations(problem.marginal(), problem.residual, stacked)
+    ridge = normal_equations(problem.marginal, problem.residual, stacked)
     return _document(ridge, problem.rows.n, chosen, added) | _shapes(chosen)
 
 
@@ -94,7 +94,7 @@ def _about_the_fit(selection: Selection, fit: Fit, problem: Problem) -> tuple[Pr
 
 def _columns(step: Linearised, candidates: Mapping[str, Candidate]) -> dict[str, KeptEffect]:
     """Return each candidate in the shape that explains most, at a step of the search."""
-    ridge = normal_equations(step.problem.marginal(), step.problem.residual, step.dictionary)
+    ridge = normal_equations(step.problem.marginal, step.problem.residual, step.dictionary)
     best: dict[str, tuple[float, KeptEffect]] = {}
     for entry in entries_of(list(candidates.values())):
         fit = ridge.part(entry.columns).solve(entry.sigma, entry.lower, entry.upper)

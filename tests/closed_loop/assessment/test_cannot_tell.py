@@ -138,7 +138,7 @@ def test_the_detectable_size_is_seen_in_95_of_100(name, draws):
         c = candidate.coordinates[candidate.amplitudes[0]]
         z = abs(c.z(c.neutral + size))
         # the shape that the size is of is the one that shows most
-        gains = [np.linalg.norm(problem.marginal()(J[:, e.columns[0]])) for e in entries]
+        gains = [np.linalg.norm(problem.marginal(J[:, e.columns[0]])) for e in entries]
         effect = z * J[:, entries[int(np.argmax(gains))].columns[0]]
         noise = noise_draws(problem, np.random.default_rng(7), draws)
         hits = 0

@@ -235,7 +235,7 @@ def test_intervals_cover():
     rng, rows, C, Z = small_problem(4)
     J = rng.normal(size=(rows.n, 1)) * 3e-4
     m = Marginal(C, Z)
-    whitener = C.whitener()
+    whitener = C.whitener
     inside = 0
     for _ in range(200):
         theta = rng.normal()
@@ -248,7 +248,7 @@ def test_intervals_cover():
 
 def test_a_swapped_marker_is_trusted_less_and_a_pattern_is_not():
     rng, rows, C, _ = small_problem()
-    r = C.whitener().color(rng.standard_normal(rows.n), rows.n)
+    r = C.whitener.color(rng.standard_normal(rows.n), rows.n)
     assert (robust_inflation(rows, C, r, ALLOWANCE) == 1.0).all()
     r2 = r + 1e-3  # everything off alike: a pattern
     assert (robust_inflation(rows, C, r2, ALLOWANCE) == 1.0).all()

@@ -33,7 +33,7 @@ def _fitted(off):
     added = tuple(Added(known[e.name], known[e.name].coordinates_of(e.values)) for e in start)
     model = FittedModel(ringing.uncertain(), added)
     problem, _ = problems.at(model, forward.run([], [o])[0], [])
-    fit = fitter.fit(problem, problem.marginal(), model, range(2))
+    fit = fitter.fit(problem, problem.marginal, model, range(2))
     values = model.with_fit(fit).effects
     return float(values[1].values["ratio"]), float(values[0].values["rayleigh_beta"])
 

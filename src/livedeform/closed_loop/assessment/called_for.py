@@ -58,7 +58,7 @@ def called_for(
     The standard error is no less than that of independent data, nor than what presses and markers differ by; what is
     let go instead of ``pressed`` shows itself in one stretch of time, and is counted over markers alone.
     """
-    marginal, rows = problem.marginal(), problem.rows
+    marginal, rows = problem.marginal, problem.rows
     seen = rows.marker >= 0
     left, motion = marginal(without)[seen], marginal(without - having)[seen]
     size = float(motion @ motion)

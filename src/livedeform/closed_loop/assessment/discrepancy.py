@@ -92,7 +92,7 @@ def discrepancy(
 ) -> Discrepancy:
     """Test and estimate what is left in the problem's residual; ``shape`` (k, m)."""
     amplitudes, draws = settings.discrepancy.amplitudes, settings.discrepancy.draws
-    marginal, points = problem.marginal(), problem.rows.marker >= 0
+    marginal, points = problem.marginal, problem.rows.marker >= 0
     B, r = marginal(basis), marginal(problem.residual)
     lmbda, V = np.linalg.eigh(B.T @ B)
     lmbda = np.maximum(lmbda, 0.0)

@@ -126,7 +126,7 @@ class NextExperiment:
         plan = FittedModel(replace(model.uncertain, always=()))
         problem, J = ProblemFactory([observation], self.settings.allowance).at(plan, apart.rival, columns)
         d = problem.rows.take(apart.points)
-        marginal = problem.marginal()
+        marginal = problem.marginal
         dw, Jw = marginal(np.nan_to_num(d)), marginal(J)
         A = Jw.T @ Jw + np.diag(1.0 / np.maximum(known, TINY) ** 2)
         g = Jw.T @ dw

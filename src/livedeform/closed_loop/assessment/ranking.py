@@ -131,7 +131,7 @@ class Ranking:
         if first is None:
             return {}
         entries = {(e.name, e.shape): list(e.columns) for e in entries_of(list(self.selection.candidates.values()))}
-        marginal, out = first.problem.marginal(), {}
+        marginal, out = first.problem.marginal, {}
         for name, one in found.items():
             if isinstance(one, Refined):
                 residual = one.fit.residual

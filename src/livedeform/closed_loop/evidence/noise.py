@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
@@ -108,15 +109,20 @@ class Covariance:
         parts = [self.rows.marker[a:b] >= 0 for a, b in pairwise(self.rows.bounds)]
         return replace(self, blocks=tuple(C + size**2 * np.diag(p) for C, p in zip(self.blocks, parts, strict=True)))
 
-    def whitener(self, keep: np.ndarray | None = None) -> Whitener:
-        """Return the whitener of all rows, or of those where ``keep`` (n,) is True."""
+    @cached_property
+    def whitener(self) -> Whitener:
+        """The whitener of all rows."""
+        return self.whitener_of(np.ones(self.rows.n, bool))
+
+    def whitener_of(self, keep: np.ndarray) -> Whitener:
+        """Return the whitener of the rows where ``keep`` (n,) is True."""
         factors, picks = [], []
-        for g, block in enumerate(self.blocks):
-            a, b = self.rows.bounds[g], self.rows.bounds[g + 1]
-            pick = np.arange(a, b) if keep is None else a + np.flatnonzero(keep[a:b])
+        for (a, b), block in zip(pairwise(self.rows.bounds), self.blocks, strict=True):
+            pick = np.flatnonzero(keep[a:b])
             if len(pick):
-                picks.append(pick)
-                factors.append(np.asarray(np.linalg.cholesky(block[np.ix_(pick - a, pick - a)]), float))
+                picks.append(a + pick)
+                part = block if len(pick) == b - a else block[np.ix_(pick, pick)]
+                factors.append(np.asarray(np.linalg.cholesky(part), float))
         return Whitener(tuple(picks), tuple(factors))
 
 

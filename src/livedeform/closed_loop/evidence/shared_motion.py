@@ -36,17 +36,20 @@ class Unshared:
         """Find the covariances (lags + 1,) that the residual of noise has whose variance is one and whose correlation
         between ``seconds`` (f,) fades as exp(-dt / tau), white with a ``tau`` of 0 s, on average over pairs of
         ``frames`` (f,) so many frames apart: what the courses took with them is missing."""
-        C = self.courses
+        C, among = self.courses, frames.astype(float)
         RC = _faded(C, np.exp(-np.diff(seconds) / tau)) if tau > 0.0 else C
         inner = 0.5 * (C.T @ RC)
         half = RC - C @ inner  # M R M = R - C half^T - half C^T
-        out = np.empty(lags + 1)
+        C, half = among[:, None] * C, among[:, None] * half
+        out = np.zeros(lags + 1)
         for k in range(lags + 1):
-            i = np.flatnonzero(frames[k:] & frames[: len(frames) - k])
-            j = i + k
-            lost = (C[i] * half[j] + half[i] * C[j]).sum(axis=1)
-            correlation = np.exp(-(seconds[j] - seconds[i]) / tau) if tau > 0.0 else float(k == 0)
-            out[k] = float((correlation - lost).mean()) if len(i) else 0.0
+            n = len(C) - k
+            pairs = among[k:] * among[:n]
+            if not pairs.any():
+                continue
+            lost = np.vdot(C[:n], half[k:]) + np.vdot(half[:n], C[k:])
+            correlation = np.exp((seconds[:n] - seconds[k:]) / tau) if tau > 0.0 else float(k == 0)
+            out[k] = float((pairs * correlation).sum() - lost) / pairs.sum()
         # one direction in space goes with each course that the data themselves chose
         kept: float = max(1.0 - (C.shape[1] - 1) / (3.0 * len(self.markers)), 0.0)
         return out * kept

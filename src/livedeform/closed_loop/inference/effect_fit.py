@@ -103,14 +103,14 @@ class EffectFitter:
         settings, points = self.method.settings, problem.rows.marker >= 0
         size, residual = np.inf, tried(start)[0]
         while (left := float(np.sqrt(np.mean(residual[points] ** 2)))) < settings.falls * size:
-            rough = replace(problem, covariance=problem.covariance.roughened(left)).marginal()
+            rough = replace(problem, covariance=problem.covariance.roughened(left)).marginal
             fit = self.method(tried, rough, start, prior, c0=np.inf, max_runs=settings.roughly, glance=tried.glance)
             size, start, residual = left, fit.z, fit.residual
         return start
 
     def refit(self, problem: Problem, model: FittedModel, *, goes_on: bool = False) -> FittedModel | None:
         """Fit all added effects together; None if the model cannot be solved there."""
-        fit = self.fit(problem, problem.marginal(), model, free=range(len(model.added)), goes_on=goes_on)
+        fit = self.fit(problem, problem.marginal, model, free=range(len(model.added)), goes_on=goes_on)
         return None if fit is None else model.with_fit(fit)
 
 

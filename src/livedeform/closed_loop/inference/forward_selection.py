@@ -275,7 +275,7 @@ class ForwardSelection:
                 return refined, better, able
             ended.add(best.candidate.name)
             start = self.trying(model, best.candidate.name, best.fit.z, best.joint)
-            refined = refined | self._refine_all(problem, problem.marginal(), [start], goes_on=True)
+            refined = refined | self._refine_all(problem, problem.marginal, [start], goes_on=True)
 
     def nothing_added(
         self, screened: Screened, refined: Mapping[str, Refined], better: Sequence[Refined]
@@ -300,7 +300,7 @@ class ForwardSelection:
     def beyond_chance(self, problem: Problem, residual: Array) -> float:
         """Return how much larger the chi2 of a residual is than chance makes it."""
         n = problem.rows.n
-        return max(float(np.sum(problem.marginal()(residual) ** 2) - n - 2.0 * np.sqrt(2.0 * n)), 0.0)
+        return max(float(np.sum(problem.marginal(residual) ** 2) - n - 2.0 * np.sqrt(2.0 * n)), 0.0)
 
     def left_by(self, problem: Problem, screened: Screened) -> float:
         """Return how much chi2 beyond chance the leading candidate leaves, to first order."""
@@ -353,7 +353,7 @@ class ForwardSelection:
         wrong frequency is out of phase, and its columns tell nothing."""
         early = beginning(self.observations, self.settings.beginning)
         keep = (early if early.sum() > 1 else np.ones_like(early))[problem.rows.moment]
-        ridge = normal_equations(problem.marginal(keep), problem.residual, dictionary)
+        ridge = normal_equations(problem.marginal_of(keep), problem.residual, dictionary)
         gains: dict[str, float] = {}
         for e in entries_of(self.remaining(model)):
             gain = ridge.part(e.columns).solve(e.sigma, e.lower, e.upper).gain
@@ -381,7 +381,7 @@ class ForwardSelection:
             least = self.settings.lead_share_no_tangent * max(early_gains.values())
             able = [n for n, gain in early_gains.items() if (gain >= least or n in hidden) and n not in too_small]
             leading = sorted(able, key=lambda n: (n not in hidden, -early_gains[n]))[: self.settings.leaders]
-        marginal = problem.marginal()
+        marginal = problem.marginal
         self.tell("fitting " + ", ".join(leading), None)
         starts = [self.trying(model, n, z) for n in leading for z in self.starts_of(screened[n])]
         found = self._refine_all(problem, marginal, starts, max_runs=self.settings.first_runs)

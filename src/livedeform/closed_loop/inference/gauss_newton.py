@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,7 +35,7 @@ class Marginal:
     """
 
     def __init__(self, covariance: Covariance, nuisance: Nuisance, keep: np.ndarray | None = None) -> None:
-        self.whitener = covariance.whitener(keep)
+        self.whitener = covariance.whitener if keep is None else covariance.whitener_of(keep)
         Zw = self.whitener.whiten(nuisance.columns)
         lmbda, V = np.linalg.eigh(Zw.T @ Zw)
         used = lmbda > RANK * max(lmbda.max(initial=0.0), NOTHING)
@@ -58,20 +59,25 @@ class Problem:
     covariance: Covariance
     nuisance: Nuisance
 
-    def marginal(self, keep: np.ndarray | None = None) -> Marginal:
-        """Integrate the nuisance out, on all rows or those to ``keep`` (n,)."""
+    @cached_property
+    def marginal(self) -> Marginal:
+        """Integrates the nuisance out, on all rows."""
+        return Marginal(self.covariance, self.nuisance)
+
+    def marginal_of(self, keep: np.ndarray) -> Marginal:
+        """Integrate the nuisance out on the rows to ``keep`` (n,)."""
         return Marginal(self.covariance, self.nuisance, keep)
 
     @property
     def chi2(self) -> float:
         """Chi-square of the residual, with all that is uncertain anyway integrated out."""
-        return float(np.sum(self.marginal()(self.residual) ** 2))
+        return float(np.sum(self.marginal(self.residual) ** 2))
 
     def left(self, fit: Fit) -> float:
         """Return the chi2 per datum that a fit of it leaves; NaN of a fit to other data."""
         if len(fit.residual) != self.rows.n:
             return float("nan")
-        return replace(self, residual=fit.residual).chi2 / self.rows.n
+        return float(np.sum(self.marginal(fit.residual) ** 2)) / self.rows.n
 
 
 @dataclass(frozen=True)

@@ -48,7 +48,7 @@ def mesh_patterns(
 
 def followed(problem: Problem, fit: Fit, errors: Array) -> Array:
     """Return by how much the coordinates (p, k) of a fit follow ``errors`` (rows, k) of the prediction."""
-    marginal = problem.marginal()
+    marginal = problem.marginal
     return np.asarray(fit.covariance @ (marginal(fit.columns).T @ marginal(errors)))
 
 
@@ -68,11 +68,11 @@ def between_presses(problem: Problem, fit: Fit, prior: Prior) -> tuple[Array, in
         covariance = np.linalg.inv(J.T @ J + stiffness)
         return covariance @ (J.T @ r - slope), np.diag(covariance)
 
-    whole, variance = step(problem.marginal())
+    whole, variance = step(problem.marginal)
     folds = np.unique(problem.rows.fold)
     moved, expected = np.zeros(len(whole)), np.zeros(len(whole))
     for fold in folds:
-        without, larger = step(problem.marginal(problem.rows.fold != fold))
+        without, larger = step(problem.marginal_of(problem.rows.fold != fold))
         moved += (without - whole) ** 2
         expected += larger - variance
     ratio = np.divide(moved, expected, out=np.ones_like(moved), where=expected > RANK * variance)

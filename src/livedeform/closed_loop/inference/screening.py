@@ -122,7 +122,7 @@ class Screening:
             return Screened((), 1.0)
         products = self.products(problem, np.column_stack([dictionary, problem.residual]))
         ridges = [Ridge.of(product) for product in products.all]
-        n_time, marginal = len(products.time), problem.marginal()
+        n_time, marginal = len(products.time), problem.marginal
         draws = marginal(noise_draws(problem, np.random.default_rng(seed), self.settings.draws))
         b_draws = marginal(dictionary).T @ draws
         scores = [self._score([e for e in entries if e.name == name], ridges, b_draws, n_time) for name in names]
@@ -231,7 +231,7 @@ def _cross_validated(ridges: Sequence[Ridge], entries: Sequence[DictionaryEntry]
 
 def noise_draws(problem: Problem, rng: np.random.Generator, n: int) -> Array:
     """Draw residuals (rows, n) that hold nothing but C and the nuisance."""
-    whitener = problem.covariance.whitener()
+    whitener = problem.covariance.whitener
     noise = whitener.color(rng.standard_normal((problem.rows.n, n)), problem.rows.n)
     return np.asarray(
         noise + problem.nuisance.columns @ rng.standard_normal((problem.nuisance.columns.shape[1], n)), float

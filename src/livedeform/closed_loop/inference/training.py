@@ -37,7 +37,7 @@ class Products(NamedTuple):
         """Form those of ``columns`` (n, p), with as many interleaved groups of markers."""
         rows, p = problem.rows, columns.shape[1]
         both = np.column_stack([columns, problem.nuisance.columns])
-        whitened = problem.covariance.whitener().whiten(both)
+        whitened = problem.covariance.whitener.whiten(both)
         groups = np.zeros((n_groups, both.shape[1], both.shape[1]))
         whole = np.zeros_like(groups[0])
         for a, b in pairwise(rows.bounds):
@@ -47,7 +47,7 @@ class Products(NamedTuple):
                 groups[rows.marker[a] % n_groups] += own
         time = []
         for fold in np.unique(rows.fold):
-            kept = problem.covariance.whitener(rows.fold != fold).whiten(both)
+            kept = problem.covariance.whitener_of(rows.fold != fold).whiten(both)
             time.append(_marginal(kept.T @ kept, p))
         return cls(_marginal(whole, p), time, [_marginal(whole - group, p) for group in groups])
 
