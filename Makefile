@@ -14,7 +14,7 @@ PURE_TESTS := tests/common tests/compare_node
 # one thread each: the test workers share the cores
 ONE_THREAD := OMP_NUM_THREADS=1 MKL_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 NUMBA_NUM_THREADS=1
 
-.PHONY: demo docs test test-slow check types coverage bench lock blind-test colcon clean
+.PHONY: demo docs test test-slow check static coverage bench lock blind-test colcon clean
 
 demo: $(VENV)/installed ## the main job on the shipped experiment: report in out/demo
 	$(BIN)/livedeform demo --out $(DEMO_OUT) --force
@@ -25,20 +25,20 @@ test: $(VENV)/installed ## the tests (a few minutes)
 test-slow: $(VENV)/installed ## the tests that take minutes, and those over many seeds
 	$(ONE_THREAD) $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile -m "slow or statistical"
 
-check: $(VENV)/check-installed ## what CI runs: the pinned packages, style, types, tests with the site, coverage of the pure layers
+check: ## what CI runs: the pinned packages, style, types, tests with the site, coverage of the pure layers
+	$(MAKE) --no-print-directory -j 2 static coverage
+	$(MAKE) --no-print-directory test
+
+# in a fresh clone kernels compile while the rest is installed and these begin
+static: $(VENV)/check-installed ## what runs nothing: the pinned packages, style, types
 ifneq ($(LOCK),)
 	$(BIN)/python .ci/packages.py check
 endif
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	$(MAKE) --no-print-directory -j 2 types coverage
-	$(MAKE) --no-print-directory test
-
-# kernels compile beside it in a fresh clone
-types: $(VENV)/check-installed ## the types, by mypy
 	$(BIN)/mypy
 
-coverage: $(VENV)/installed ## the coverage of the pure layers by their own tests: cheap, unlike a trace of the whole suite
+coverage: $(VENV)/installed $(VENV)/check-installed ## the coverage of the pure layers by their own tests: cheap, unlike a trace of the whole suite
 	$(ONE_THREAD) $(BIN)/python -m pytest -q -m "not slow and not statistical" $(PURE_TESTS) --cov --cov-report=
 	@echo "coverage of common and compare_node by their own tests: $$($(BIN)/coverage report --format=total) %"
 
@@ -50,7 +50,7 @@ $(VENV)/check-installed: $(VENV)/packages $(CHECK_LOCK)
 ifeq ($(LOCK),)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[$(EXTRAS),$(CHECK_EXTRAS)]'
 else
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --require-hashes -r $(CHECK_LOCK)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile --no-deps --require-hashes -r $(CHECK_LOCK)
 endif
 	@touch $@
 
@@ -64,7 +64,7 @@ $(VENV)/packages: pyproject.toml setup.py $(LOCK)
 ifeq ($(LOCK),)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[$(EXTRAS)]'
 else
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --require-hashes -r $(LOCK) || \
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile --no-deps --require-hashes -r $(LOCK) || \
 	  { echo "the tested packages do not fit this machine; 'make LOCK=' takes others, within pyproject.toml's bounds" >&2; exit 2; }
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation -e .
 	$(BIN)/python -m pip --disable-pip-version-check check
