@@ -11,6 +11,7 @@ from livedeform.common.types import Array
 from livedeform.fem_node.mesh.tet_mesh import IntArray
 
 FEWEST = 2.0  # elements through the thinnest part
+PRODUCTS = 1_000_000  # of rays with triangles at once, which take up memory
 RAYS = 800  # from the surface inwards, spread evenly over its area
 FACING = 0.85  # cosine between the two sides of a plate or limb; less is a wedge, which is thin at every rim
 SHARE = 0.02  # of the surface that must be as thin, so that a notch or a speck is no part of the body
@@ -26,14 +27,17 @@ class Thickness(NamedTuple):
 def thinnest_part(vertices: Array, triangles: IntArray) -> Thickness:
     """Measure a closed surface (vertices (n, 3) m, triangles (k, 3) outward) along its inward normals, from places
     spread over it to the side that faces them."""
-    corners = vertices[triangles]
+    corners = (vertices - vertices.mean(axis=0))[triangles]
     cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     area = np.linalg.norm(cross, axis=1)
     normals = cross / np.maximum(area, 1e-300)[:, None]
     places, of = _spread(corners, area, RAYS)
-    through = np.array([_through(places[k], normals[of[k]], corners, normals) for k in range(RAYS)])
-    at = int(np.argsort(through)[int(SHARE * RAYS)])
-    x, y, z = (float(c) for c in places[at])
+    at_once = max(PRODUCTS // len(corners), 1)
+    batches = [slice(k, k + at_once) for k in range(0, RAYS, at_once)]
+    through = np.concatenate([_through(places[b], normals[of[b]], corners, cross, normals) for b in batches])
+    order = np.argsort(np.round(through, 12), kind="stable")  # a plate is as thin everywhere: rounding tells no place
+    at = int(order[int(SHARE * RAYS)])
+    x, y, z = (float(c) for c in places[at] + vertices.mean(axis=0))
     return Thickness(float(through[at]), (x, y, z))
 
 
@@ -61,19 +65,22 @@ def _spread(corners: Array, area: Array, n: int) -> tuple[Array, IntArray]:
     return np.einsum("nc,nci->ni", weights, corners[of]), of
 
 
-def _through(start: Array, normal: Array, corners: Array, normals: Array) -> float:
-    """Return the distance (m) from ``start`` (3,) on the surface inwards to the next side, inf if that does not face it
-    (Moeller & Trumbore 1997)."""
-    ab, ac = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-    p = np.cross(-normal, ac)
-    determinant = (ab * p).sum(axis=1)
+def _through(starts: Array, inner: Array, corners: Array, cross: Array, normals: Array) -> Array:
+    """Return the distances (r,) m from ``starts`` (r, 3) on the surface, whose normals are ``inner`` (r, 3) there,
+    inwards to the next side, inf where that does not face it; ``cross`` (k, 3): normals as long as twice the areas.
+
+    Moeller & Trumbore 1997, whose triple products of a ray and a triangle are sums of products of what belongs to
+    either: all rays meet all triangles in a few products of matrices.
+    """
+    a, ab, ac = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    away, moment = -inner, np.cross(starts, -inner)
+    determinant = inner @ cross.T
     safe = np.where(np.abs(determinant) < 1e-300, 1.0, determinant)
-    s = start - corners[:, 0]
-    q = np.cross(s, ab)
-    u, w, far = (s * p).sum(axis=1) / safe, (q @ -normal) / safe, (ac * q).sum(axis=1) / safe
-    leaves = normals @ -normal > 0.0
-    hit = (np.abs(determinant) > 1e-300) & (u >= 0.0) & (w >= 0.0) & (u + w <= 1.0) & (far > 0.0) & leaves
-    if not hit.any():
-        return np.inf
-    nearest = int(np.argmin(np.where(hit, far, np.inf)))
-    return float(far[nearest]) if normals[nearest] @ -normal > FACING else np.inf
+    u = (moment @ ac.T - away @ np.cross(ac, a).T) / safe
+    w = (-moment @ ab.T - away @ np.cross(a, ab).T) / safe
+    far = (starts @ cross.T - (a * cross).sum(axis=1)) / safe
+    hit = (determinant < -1e-300) & (u >= 0.0) & (w >= 0.0) & (u + w <= 1.0) & (far > 0.0)
+    far = np.where(hit, far, np.inf)
+    nearest = np.argmin(far, axis=1)
+    faces = (normals[nearest] * away).sum(axis=1) > FACING
+    return np.asarray(np.where(faces, far[np.arange(len(far)), nearest], np.inf))
