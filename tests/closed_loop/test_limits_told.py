@@ -78,3 +78,25 @@ def test_a_stated_sigma_that_the_data_reject_is_named_and_holds_nothing_back(sig
     if told:
         assert found.effects[0].values["value"] == pytest.approx(float(without.values["value"]), abs=1e-4)
         assert found.effects[0].sigmas["value"] == pytest.approx(float(without.sigmas["value"]), rel=1e-2)
+
+
+def test_what_is_usual_holds_nothing_back_that_is_beyond_it() -> None:
+    """A clock 0.2 s late is four times as late as usual, known to 0.014 s: it was 0.193."""
+    late = [toy.effect("time_offset", seconds=0.2)]
+    fit, test = (
+        toy.record(late, seed=s, body=BODY, n=n, name=name, sigma=6e-4)
+        for s, n, name in ((1, 36, "fit"), (1001, 24, "test"))
+    )
+    inputs = toy_inputs(fit, test, ("time_offset",))
+    candidate = inputs.candidates["time_offset"]
+    (clock,) = candidate.coordinates
+    assert clock.sigma == 0.05
+    anything = replace(candidate, coordinates=(replace(clock, sigma=1.0),))
+    found, free = (
+        investigate(toy.ToyModel(BODY), replace(inputs, candidates={"time_offset": c})).effects[0]
+        for c in (candidate, anything)
+    )
+    sigma = float(free.sigmas["seconds"])
+    assert float(found.sigmas["seconds"]) == pytest.approx(sigma, rel=0.05)
+    # measured 0.031 of a sigma
+    assert abs(float(found.values["seconds"]) - float(free.values["seconds"])) < 0.1 * sigma

@@ -459,9 +459,20 @@ def narrowed(candidate: Candidate, sigma: Mapping[str, float], more: float) -> C
     return replace(candidate, coordinates=coordinates, stated=np.array(stated), wide=candidate)
 
 
-def by_data_alone(candidate: Candidate) -> Candidate:
-    """Return the candidate with its usual prior, which the ``stated`` sigmas that data have rejected do not narrow."""
-    return candidate if candidate.wide is None else replace(candidate, coordinates=candidate.wide.coordinates)
+def unhindered(candidate: Candidate, z: Array, most: float) -> Candidate:
+    """Return the candidate with priors that do not hold its value ``z`` (p,) back: the usual ones where the data have
+    rejected what is stated (a `doubt` of ``most``), and of a size beyond what is usual one as wide as it is.
+
+    A prior of sigma draws an estimate that the data know to s by (s / sigma)^2 of itself towards nothing.
+    """
+    rejected = doubt(z, candidate.stated, np.inf) >= most
+    wide = candidate.wide if rejected and candidate.wide is not None else candidate
+    free = ~np.isfinite(candidate.stated) | rejected
+    coordinates = tuple(
+        replace(c, sigma=abs(float(at))) if c.amplitude and c.usual is None and one and abs(at) > c.sigma else c
+        for c, at, one in zip(wide.coordinates, z, free, strict=True)
+    )
+    return replace(candidate, coordinates=coordinates)
 
 
 def doubt(theta: Array, stated: Array, most: float) -> float:

@@ -10,14 +10,14 @@ from itertools import compress
 
 import numpy as np
 
-from livedeform.closed_loop.candidates import Candidate, by_data_alone, doubt, with_start
+from livedeform.closed_loop.candidates import Candidate, unhindered, with_start
 from livedeform.closed_loop.evidence.noise import Nuisance, join
 from livedeform.closed_loop.evidence.observation import Observation, are_pressed
 from livedeform.closed_loop.forward import Column, ForwardModel, RefinedMesh, Run, dictionary_columns, stack
 from livedeform.closed_loop.inference.effect_fit import EffectFitter, RefinedMeshCorrection
 from livedeform.closed_loop.inference.fitted_model import Added, FittedModel, Uncertain
 from livedeform.closed_loop.inference.forms import as_released, in_form, of_itself, swing_rate
-from livedeform.closed_loop.inference.gauss_newton import Fit, GaussNewton, Marginal, Problem, normal_equations
+from livedeform.closed_loop.inference.gauss_newton import Fit, GaussNewton, Marginal, Prior, Problem, normal_equations
 from livedeform.closed_loop.inference.problem import ProblemFactory, beginning, is_let_go
 from livedeform.closed_loop.inference.screening import (
     DictionaryEntry,
@@ -588,20 +588,32 @@ class ForwardSelection:
         return model, notes
 
     def freed(self, problem: Problem, model: FittedModel) -> FittedModel:
-        """Fit again without the stated sigmas that the data have rejected: a wrong one would hold its value back."""
-        most = self.screening.settings.doubt
-        rejected = [doubt(a.z, a.candidate.stated, np.inf) >= most for a in model.added]
-        if model.joint is None or not any(rejected):
+        """Take the last step of the fit, with priors that hold nothing back (`unhindered`); where these change more
+        than that, fit again."""
+        if model.joint is None:
             return model
-        self.tell("fitting without what is stated and does not hold", None)
-        added = [
-            Added(by_data_alone(a.candidate), a.z) if wrong else a
-            for a, wrong in zip(model.added, rejected, strict=True)
-        ]
-        again = self.fitter.refit(problem, replace(model, added=tuple(added)))
-        if again is None or again.joint is None or again.joint.has_settled(model.joint):
-            return again or model
-        return self.mesh.corrected(problem, again, passes=1)
+        most = self.screening.settings.doubt
+        free = replace(model, added=tuple(Added(unhindered(a.candidate, a.z, most), a.z) for a in model.added))
+        held = any(
+            a.candidate.coordinates != b.candidate.coordinates for a, b in zip(model.added, free.added, strict=True)
+        )
+        ended = self._ended(problem, free)
+        if ended is not None or not held:
+            return ended or model
+        self.tell("fitting with priors as wide as what was found", None)
+        again = self.fitter.refit(problem, free, goes_on=True)
+        if again is None or again.joint is None:
+            return model
+        if not again.joint.has_settled(model.joint):
+            again = self.mesh.corrected(problem, again, passes=1)
+        return self._ended(problem, again) or again
+
+    def _ended(self, problem: Problem, model: FittedModel) -> FittedModel | None:
+        """Return a model with the last step of its fit; None where that is too long."""
+        assert model.joint is not None  # the callers'
+        prior = Prior.of([a.candidate for a in model.added], model.joint.z)
+        fit = self.fitter.method.last_step(model.joint, problem.marginal, prior)
+        return None if fit is None else model.with_fit(fit)
 
     def settle(self, model: FittedModel) -> FittedModel:
         """Fit again with the derivatives of what is allowed for in each press anew taken where an added effect of its

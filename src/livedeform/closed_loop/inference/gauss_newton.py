@@ -310,6 +310,20 @@ class GaussNewton:
         covariance = np.asarray(np.linalg.inv(A), float)
         return Fit(z, covariance, start, prior.at_bound(z), c0 - cost, residual, columns, n_runs, converged)
 
+    def last_step(self, fit: Fit, marginal: Marginal, prior: Prior) -> Fit | None:
+        """Return a fit with the step that it would still go, as its own columns tell what that changes: the model is
+        not run for a step of which little is expected, but that may be 0.7 sigma. None where more is expected."""
+        r, J = marginal(fit.residual), marginal(fit.columns)
+        A = J.T @ J + np.diag(prior.precision(fit.z))
+        b = J.T @ r - prior.slope(fit.z)
+        step = bounded_minimum(A, b, prior.lower - fit.z, prior.upper - fit.z)
+        expected = float(2.0 * b @ step - step @ A @ step)
+        if expected >= self.settings.tolerance:
+            return None
+        z, covariance = fit.z + step, np.asarray(np.linalg.inv(A), float)
+        at_bound, residual = prior.at_bound(z), fit.residual - fit.columns @ step
+        return replace(fit, z=z, covariance=covariance, at_bound=at_bound, gain=fit.gain + expected, residual=residual)
+
     def _trials(
         self, z: Array, step: Array, A: Array, b: Array, prior: Prior, level: int, *, damped: bool
     ) -> Iterator[Array]:

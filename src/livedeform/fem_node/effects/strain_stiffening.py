@@ -23,7 +23,7 @@ INFO = EffectInfo(
     summary="the material stiffens at large strain, beyond a neo-Hookean one",
     equation="W = mu/2b (exp(b (I1_iso - 3)) - 1) + volumetric part; b = 0 is neo-Hookean",
     source="Fung 1967; Demiray 1972",
-    parameters=(Parameter("b", "1", start=1.0, lower=0.0, upper=30.0, sigma=3.0, neutral=0.0, step=0.1),),
+    parameters=(Parameter("b", "1", start=1.0, lower=0.0, upper=30.0, sigma=10.0, neutral=0.0, step=0.1),),
     shown_by="two press depths",
     confused_with=("stiffness_gradient", "skin"),
     possible=_extends,
