@@ -50,7 +50,7 @@ $(VENV)/check-installed: $(VENV)/packages $(CHECK_LOCK)
 ifeq ($(LOCK),)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[$(EXTRAS),$(CHECK_EXTRAS)]'
 else
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile --no-deps --require-hashes -r $(CHECK_LOCK)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --require-hashes -r $(CHECK_LOCK)
 endif
 	@touch $@
 
@@ -64,7 +64,7 @@ $(VENV)/packages: pyproject.toml setup.py $(LOCK)
 ifeq ($(LOCK),)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[$(EXTRAS)]'
 else
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile --no-deps --require-hashes -r $(LOCK) || \
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --require-hashes -r $(LOCK) || \
 	  { echo "the tested packages do not fit this machine; 'make LOCK=' takes others, within pyproject.toml's bounds" >&2; exit 2; }
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation -e .
 	$(BIN)/python -m pip --disable-pip-version-check check
