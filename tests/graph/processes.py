@@ -33,7 +33,8 @@ def process(code: str, *arguments: str, out: Path, ends: tuple[int, ...] = (0,))
             yield child
             if child.poll() is None:
                 child.send_signal(signal.SIGINT)
-            assert child.wait(PATIENCE) in ends, out.read_text()
+            ended = child.wait(PATIENCE)
+            assert ended in ends, f"exit code {ended}: {out.read_text()}"
         finally:
             if child.poll() is None:
                 child.kill()

@@ -22,6 +22,7 @@ PR_SET_PDEATHSIG = 1  # linux/prctl.h
 WATCH_SECONDS = 0.5
 STOPS = (signal.SIGINT, signal.SIGTERM)
 INTERRUPTED = 130  # exit code
+WORKING = "working"  # the name of a thread that may be at work, in a library, when the process ends
 GRACE = 1.0  # s after a stop signal, for what would be lost anyway
 
 

@@ -13,6 +13,8 @@ from queue import SimpleQueue
 from threading import Thread
 from typing import Generic, TypeVar
 
+from livedeform.common.processes import WORKING
+
 MOST_LESSONS = 300  # that wait: the last ten seconds of poses at 30 Hz
 
 Request = TypeVar("Request")
@@ -50,7 +52,7 @@ class LatestOnly(Generic[Request, Result]):
         self._work, self._wake = work, wake
         self._jobs = SimpleQueue[tuple[Future[Result], Request] | None]()
         # a daemon: a process that ends does not wait for what nobody will hear
-        Thread(target=self._work_in_turn, name="newest", daemon=True).start()
+        Thread(target=self._work_in_turn, name=WORKING, daemon=True).start()
         self._next: list[Request] = []
         self._running: Future[Result] | None = None
         self._closed = False
