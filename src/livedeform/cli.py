@@ -8,9 +8,7 @@ from __future__ import annotations
 
 import atexit
 import gc
-import os
 import sys
-import threading
 import traceback
 import warnings
 from collections.abc import Sequence
@@ -38,7 +36,7 @@ from livedeform.commands.run import run as run_command
 from livedeform.commands.synth import synth
 from livedeform.commands.view import view
 from livedeform.common.errors import LivedeformError
-from livedeform.common.processes import INTERRUPTED, WORKING, terminable
+from livedeform.common.processes import INTERRUPTED, end, terminable
 
 DONE, NEGATIVE, WRONG = 0, 1, 2
 LISTS = ("--fit", "--test", "--after", "--repeat")  # options that take several values: --fit a.mcap b.mcap
@@ -75,13 +73,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Entry point of the console script ``livedeform``."""
     gc.set_threshold(50_000, 20, 20)  # a command keeps most of what it makes, the modules above all
     atexit.register(gc.freeze)  # nor does its end look through all of it for cycles, which took a second
-    code = run(sys.argv[1:] if arguments is None else arguments)
-    if any(thread.name == WORKING for thread in threading.enumerate()):
-        # a live model still works on what nobody will hear: the end would take its libraries away under it, and crash
-        sys.stdout.flush()
-        sys.stderr.flush()
-        os._exit(code)
-    sys.exit(code)
+    end(run(sys.argv[1:] if arguments is None else arguments))
 
 
 def run(arguments: Sequence[str]) -> int:

@@ -133,6 +133,21 @@ def test_no_worker_of_a_diagnosis_survives_it(number: signal.Signals, tmp_path: 
     assert not list(tmp_path.glob(".*draft*"))
 
 
+@pytest.mark.parametrize("stderr", ["open", "closed"])
+def test_what_nobody_will_hear_is_not_waited_for(stderr: str):
+    """The interpreter's end, beside a thread that is in a library, crashed 3 of some 75 live sessions."""
+    lines = [
+        "import sys, threading, time",
+        "from livedeform.common.processes import WORKING, end",
+        "threading.Thread(target=time.sleep, args=(600.0,), name=WORKING).start()",
+        "print('said')",
+        "sys.stderr.close()" if stderr == "closed" else "",
+        "end(3)",
+    ]
+    done = subprocess.run([sys.executable, "-c", "\n".join(lines)], capture_output=True, text=True, timeout=300.0)
+    assert (done.returncode, done.stdout, done.stderr) == (3, "said\n", "")
+
+
 @linux
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["stereo_node", "fem_node", "compare_node"])

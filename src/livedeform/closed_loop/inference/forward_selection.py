@@ -300,7 +300,7 @@ class ForwardSelection:
     def beyond_chance(self, problem: Problem, residual: Array) -> float:
         """Return how much larger the chi2 of a residual is than chance makes it."""
         n = problem.rows.n
-        return max(float(np.sum(problem.marginal(residual) ** 2) - n - 2.0 * np.sqrt(2.0 * n)), 0.0)
+        return max(problem.chi2_of(residual) - n - 2.0 * float(np.sqrt(2.0 * n)), 0.0)
 
     def left_by(self, problem: Problem, screened: Screened) -> float:
         """Return how much chi2 beyond chance the leading candidate leaves, to first order."""
@@ -600,7 +600,7 @@ class ForwardSelection:
         ended = self._ended(problem, free)
         if ended is not None or not held:
             return ended or model
-        self.tell("fitting with priors as wide as what was found", None)
+        self.tell("fitting with priors that hold nothing back", None)
         again = self.fitter.refit(problem, free, goes_on=True)
         if again is None or again.joint is None:
             return model

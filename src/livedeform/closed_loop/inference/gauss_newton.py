@@ -71,13 +71,17 @@ class Problem:
     @property
     def chi2(self) -> float:
         """Chi-square of the residual, with all that is uncertain anyway integrated out."""
-        return float(np.sum(self.marginal(self.residual) ** 2))
+        return self.chi2_of(self.residual)
+
+    def chi2_of(self, residual: Array) -> float:
+        """Return the chi-square of another ``residual`` (n,)."""
+        return float(np.sum(self.marginal(residual) ** 2))
 
     def left(self, fit: Fit) -> float:
         """Return the chi2 per datum that a fit of it leaves; NaN of a fit to other data."""
         if len(fit.residual) != self.rows.n:
             return float("nan")
-        return float(np.sum(self.marginal(fit.residual) ** 2)) / self.rows.n
+        return self.chi2_of(fit.residual) / self.rows.n
 
 
 @dataclass(frozen=True)
@@ -279,10 +283,7 @@ class GaussNewton:
         cost = _cost(r, prior, z)
         while True:
             # 1. the step that the linearisation asks for
-            A = J.T @ J + np.diag(prior.precision(z))
-            b = J.T @ r - prior.slope(z)
-            step = bounded_minimum(A, b, prior.lower - z, prior.upper - z)
-            expected = float(2.0 * b @ step - step @ A @ step)
+            A, b, step, expected = _next_step(r, J, prior, z)
             if expected < self.settings.tolerance:
                 converged = True
                 break
@@ -314,10 +315,7 @@ class GaussNewton:
         """Return a fit with the step that it would still go, as its own columns tell what that changes: the model is
         not run for a step of which little is expected, but that may be 0.7 sigma. None where more is expected."""
         r, J = marginal(fit.residual), marginal(fit.columns)
-        A = J.T @ J + np.diag(prior.precision(fit.z))
-        b = J.T @ r - prior.slope(fit.z)
-        step = bounded_minimum(A, b, prior.lower - fit.z, prior.upper - fit.z)
-        expected = float(2.0 * b @ step - step @ A @ step)
+        A, _, step, expected = _next_step(r, J, prior, fit.z)
         if expected >= self.settings.tolerance:
             return None
         z, covariance = fit.z + step, np.asarray(np.linalg.inv(A), float)
@@ -333,6 +331,15 @@ class GaussNewton:
             return
         for damping in self.settings.dampings[level:]:
             yield z + bounded_minimum(A + damping * np.diag(np.diag(A)), b, prior.lower - z, prior.upper - z)
+
+
+def _next_step(r: Array, J: Array, prior: Prior, z: Array) -> tuple[Array, Array, Array, float]:
+    """Return the normal equations A (p, p) and b (p,) at ``z`` (p,), of the whitened residual ``r`` (n,) and columns
+    ``J`` (n, p), the step within bounds that these ask for, and the gain that is expected of it."""
+    A = J.T @ J + np.diag(prior.precision(z))
+    b = J.T @ r - prior.slope(z)
+    step = bounded_minimum(A, b, prior.lower - z, prior.upper - z)
+    return A, b, step, float(2.0 * b @ step - step @ A @ step)
 
 
 def _or_lost(residuals: Residuals, z: Array, residual: Array, columns: Array) -> tuple[Array, Array]:

@@ -21,7 +21,7 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.subscription import Subscription
 
 from livedeform.common.errors import LivedeformError
-from livedeform.common.processes import INTERRUPTED
+from livedeform.common.processes import INTERRUPTED, end
 from livedeform.common.ros.messages import from_time, to_diagnostics
 from livedeform.common.ros.session import LONG_QUEUE, quality, run_node
 from livedeform.common.ros.traffic import Traffic
@@ -205,6 +205,7 @@ def run(make: Callable[[], CountingNode], args: Sequence[str] | None = None) -> 
         run_node(started, args)
     except LivedeformError as error:
         print(error, file=sys.stderr)
-        sys.exit(2)
+        end(2)
     except KeyboardInterrupt:
-        sys.exit(INTERRUPTED)
+        end(INTERRUPTED)
+    end(0)

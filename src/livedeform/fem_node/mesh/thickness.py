@@ -27,7 +27,8 @@ class Thickness(NamedTuple):
 def thinnest_part(vertices: Array, triangles: IntArray) -> Thickness:
     """Measure a closed surface (vertices (n, 3) m, triangles (k, 3) outward) along its inward normals, from places
     spread over it to the side that faces them."""
-    corners = (vertices - vertices.mean(axis=0))[triangles]
+    middle = vertices.mean(axis=0)
+    corners = (vertices - middle)[triangles]
     cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     area = np.linalg.norm(cross, axis=1)
     normals = cross / np.maximum(area, 1e-300)[:, None]
@@ -37,7 +38,7 @@ def thinnest_part(vertices: Array, triangles: IntArray) -> Thickness:
     through = np.concatenate([_through(places[b], normals[of[b]], corners, cross, normals) for b in batches])
     order = np.argsort(np.round(through, 12), kind="stable")  # a plate is as thin everywhere: rounding tells no place
     at = int(order[int(SHARE * RAYS)])
-    x, y, z = (float(c) for c in places[at] + vertices.mean(axis=0))
+    x, y, z = (float(c) for c in places[at] + middle)
     return Thickness(float(through[at]), (x, y, z))
 
 
