@@ -80,3 +80,19 @@ def test_its_slope_and_precision_are_those_of_its_cost():
     plain, nothing = (Prior.of([c], z) for c in (PLAIN, BALL))
     assert (nothing.cost(z), list(nothing.precision(z))) == (plain.cost(z), list(plain.precision(z)))
     assert plain.precision(z) == pytest.approx(1.0 / plain.sigma**2)
+
+
+def test_a_wider_prior_at_the_end_is_as_if_it_had_been_there_from_the_start():
+    """A value of 12, known to 0.8, with what is usual of 5: that draws it down, and is no part of what is gained."""
+
+    def residuals(z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return (12.0 - z) / 0.8, np.array([[1.0 / 0.8]])
+
+    def fitted(prior: Prior) -> Fit:
+        return METHOD(residuals, lambda r: r, np.zeros(1), prior, c0=(12.0 / 0.8) ** 2, max_runs=9)
+
+    usual, wide = (Prior(np.zeros(1), np.array([sigma]), np.full(1, -99.0), np.full(1, 99.0)) for sigma in (5.0, 12.0))
+    held, free = fitted(usual), fitted(wide)
+    ended = METHOD.last_step(held, lambda r: r, wide, usual)
+    assert ended is not None and ended.z == pytest.approx(free.z) and ended.sigma == pytest.approx(free.sigma)
+    assert ended.gain == pytest.approx(free.gain) and held.gain < free.gain - 4.0  # measured 4.6 less

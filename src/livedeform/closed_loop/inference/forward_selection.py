@@ -597,7 +597,7 @@ class ForwardSelection:
         held = any(
             a.candidate.coordinates != b.candidate.coordinates for a, b in zip(model.added, free.added, strict=True)
         )
-        ended = self._ended(problem, free)
+        ended = self._ended(problem, free, model)
         if ended is not None or not held:
             return ended or model
         self.tell("fitting with priors that hold nothing back", None)
@@ -606,13 +606,15 @@ class ForwardSelection:
             return model
         if not again.joint.has_settled(model.joint):
             again = self.mesh.corrected(problem, again, passes=1)
-        return self._ended(problem, again) or again
+        return self._ended(problem, again, again) or again
 
-    def _ended(self, problem: Problem, model: FittedModel) -> FittedModel | None:
-        """Return a model with the last step of its fit; None where that is too long."""
+    def _ended(self, problem: Problem, model: FittedModel, held: FittedModel) -> FittedModel | None:
+        """Return a model with the last step of its fit, which was by the priors of the model ``held``; None where that
+        is too long."""
         assert model.joint is not None  # the callers'
-        prior = Prior.of([a.candidate for a in model.added], model.joint.z)
-        fit = self.fitter.method.last_step(model.joint, problem.marginal, prior)
+        z = model.joint.z
+        prior, before = (Prior.of([a.candidate for a in m.added], z) for m in (model, held))
+        fit = self.fitter.method.last_step(model.joint, problem.marginal, prior, before)
         return None if fit is None else model.with_fit(fit)
 
     def settle(self, model: FittedModel) -> FittedModel:

@@ -311,16 +311,18 @@ class GaussNewton:
         covariance = np.asarray(np.linalg.inv(A), float)
         return Fit(z, covariance, start, prior.at_bound(z), c0 - cost, residual, columns, n_runs, converged)
 
-    def last_step(self, fit: Fit, marginal: Marginal, prior: Prior) -> Fit | None:
-        """Return a fit with the step that it would still go, as its own columns tell what that changes: the model is
-        not run for a step of which little is expected, but that may be 0.7 sigma. None where more is expected."""
+    def last_step(self, fit: Fit, marginal: Marginal, prior: Prior, held: Prior) -> Fit | None:
+        """Return a fit, which the prior ``held``, with the step that it would still go by ``prior``, as its own columns
+        tell what that changes: the model is not run for a step of which little is expected, but that may be 0.7 sigma.
+        None where more is expected."""
         r, J = marginal(fit.residual), marginal(fit.columns)
         A, _, step, expected = _next_step(r, J, prior, fit.z)
         if expected >= self.settings.tolerance:
             return None
         z, covariance = fit.z + step, np.asarray(np.linalg.inv(A), float)
         at_bound, residual = prior.at_bound(z), fit.residual - fit.columns @ step
-        return replace(fit, z=z, covariance=covariance, at_bound=at_bound, gain=fit.gain + expected, residual=residual)
+        gain = fit.gain + held.cost(fit.z) - prior.cost(fit.z) + expected
+        return replace(fit, z=z, covariance=covariance, at_bound=at_bound, gain=gain, residual=residual)
 
     def _trials(
         self, z: Array, step: Array, A: Array, b: Array, prior: Prior, level: int, *, damped: bool
