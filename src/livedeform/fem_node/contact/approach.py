@@ -5,7 +5,8 @@ it came in only if the probe has not gone too far at once: a point near an edge 
 is deeper than the middle leaves by the back, and Newton's method then finds a state that is in balance, free of
 penetration, and wrong. So a step is admissible as long as no point of the surface, kept still, is deep inside the
 probe, none is pushed elsewhere than before the step, and the probe does not disappear in the body. A probe that was
-nowhere before, or whose straight way fails, comes along its axis from outside.
+nowhere before, or whose straight way fails, comes along its axis from outside; not one that rubs or sticks where it
+touches, since what it has dragged along would be undone.
 
 On elements much larger than the probe's edges an elastic body has equilibria that belong to the way: a surface that a
 probe drags along sideways hangs on its edges. Of a body without memory the one from outside along the axis is meant,
@@ -74,11 +75,14 @@ class Approach:
 
     contact: Touchable
 
-    def ways(self, x: Array, start: Moment, moment: Moment, came: Array | None, *, anew: bool) -> list[list[Moment]]:
+    def ways(
+        self, x: Array, start: Moment, moment: Moment, came: Array | None, *, anew: bool, stays: bool
+    ) -> list[list[Moment]]:
         """Moments to pass from ``start`` (left out) to ``moment``, for each way there is; the likeliest first.
 
         ``anew``: a body without memory, which is approached from outside where the straight way is a jump or a slide
-        since the pose ``came``. `ConvergenceError` where there is no way, since surface that is held cannot make way.
+        since the pose ``came``; ``stays``: a probe that rubs or sticks where it touches, which a way that leaves the
+        body would undo. `ConvergenceError` where there is no way, since surface that is held cannot make way.
         """
         if moment.pose is None:
             return [[moment]]
@@ -91,6 +95,8 @@ class Approach:
         before[:3, 3] -= self.deepest * moment.pose[:3, 2]
         known = start.pose is not None and not self._held_between(x, start.pose, moment.pose)
         straight = [[moment]] if known or self.admissible(x, before, moment.pose) else []
+        if stays and straight:
+            return straight
         if not self._held_between(x, outside, moment.pose):
             if anew and self.slid(came, moment.pose):
                 return [around]

@@ -318,8 +318,9 @@ class ProbeContact(PlainItem):
         self.immovable = np.flatnonzero(np.isin(self.dofs, dofs).all(axis=1))
 
     def ways(self, x: Array, start: Moment, moment: Moment) -> Sequence[Sequence[Moment]]:
-        """Straight from where the probe was, or from outside along its axis."""
-        return self.approach.ways(x, start, moment, self.state.came, anew=self.approaches)
+        """Straight from where the probe was, or from outside along its axis; only straight where it rubs or sticks."""
+        stays = self.drags and bool(self.state.touches.any())
+        return self.approach.ways(x, start, moment, self.state.came, anew=self.approaches, stays=stays)
 
     def furthest(self, x: Array, start: Moment, moment: Moment, done: float) -> float:
         """Return the part (0..1) of the way to ``moment`` that may be gone to in one step after ``done``: as far as the
