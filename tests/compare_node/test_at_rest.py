@@ -148,3 +148,15 @@ def test_markers_on_a_line_show_no_turn_about_it(direction: list[float], beside:
     assert found.shift == pytest.approx([4e-4, 0.0, 0.0], abs=2e-5)  # measured 0.8e-5
     assert abs(np.dot(found.turn, axis)) < 0.01  # measured 0.0029
     assert np.dot(found.turn, across) == pytest.approx(0.02, abs=5e-4)  # measured 1.8e-4
+
+
+@pytest.mark.parametrize("bend", [0.0, 0.01])
+def test_a_stated_rest_is_told_from_a_trackers_frame_by_markers_that_make_one(bend: float):
+    """Three markers on the support that lie on a line leave a turn about it open, and the tracker's frame with it."""
+    line = np.array([[-0.03, bend, 0.0], [0.0, -bend, 0.0], [0.03, bend, 0.0]])
+    places = np.concatenate([PLACES[:5], line])
+    kinds = np.array(["surface"] * 5 + ["support"] * 3)
+    markers = Markers(np.arange(8, dtype=np.uint32), places, np.full(8, np.nan), kinds)
+    found = at_rest(_recording(np.full((8, 3), 5e-4)), markers)[0]
+    assert found.contradicts and found.held == (3 if bend else 0)
+    assert ("does not come from these markers" in found.text) == (not bend)

@@ -29,7 +29,7 @@ from livedeform.common.checks.recorded import drifts_clock_ns, load_checked
 from livedeform.common.effect import Surroundings
 from livedeform.common.errors import InputError, MeshError
 from livedeform.common.experiment.yaml_file import Experiment, load_experiment
-from livedeform.common.frames import pose_matrix
+from livedeform.common.frames import make_a_frame, pose_matrix
 from livedeform.common.types import Array, EffectValues
 from livedeform.fem_node.declared import declared_physics
 from livedeform.fem_node.effects import apply_effects
@@ -183,7 +183,7 @@ def _surroundings(
         upper=setting.mesh.nodes.max(axis=0),
         markers=experiment.markers.points,
         internal=bool((kinds == "internal").any()),
-        on_support=int((kinds == "support").sum()),
+        support_makes_a_frame=make_a_frame(experiment.markers.points[kinds == "support"]),
         duration=max(float(o.seconds[-1]) for o in evidence.fitted),
         has_probe=experiment.probe is not None and bool(len(fitted[0].poses)),
         contacts=contacts_of(evidence.fitted, settings.sampling.depth)[2],

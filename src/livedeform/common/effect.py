@@ -52,10 +52,11 @@ class Surroundings:
 
     ``physics`` is the declared `fem_node.physics.record.Physics` (a higher layer's, hence untyped). ``lower``,
     ``upper`` (3,) m are the body's corners, ``markers`` (m, 3) m its markers at rest, some of them ``internal`` or not,
-    and so many ``on_support``. Cameras whose place is known are there if it ``has_cameras``; it is ``filmed`` if there
-    are any. The recordings last ``duration`` s; the probe touched at ``contacts`` (c, 3) m and was accelerated by
-    ``jolt`` m/s2 at most; ``moments`` (k,) s are the key moments after the drifts' clock's start. The body
-    ``has_loads`` if something besides its weight loads it in some recording. ``bare``: the physics without the effects
+    and those on the support make a frame (``support_makes_a_frame``) if they leave no turn open. Cameras whose place is
+    known are there if it ``has_cameras``; it is ``filmed`` if there are any. The recordings last ``duration`` s; the
+    probe touched at ``contacts`` (c, 3) m and was accelerated by ``jolt`` m/s2 at most; ``moments`` (k,) s are the key
+    moments after the drifts' clock's start. The body ``has_loads`` if something besides its weight loads it in some
+    recording. ``bare``: the physics without the effects
     that the experiment has (None: it has none).
     """
 
@@ -73,7 +74,7 @@ class Surroundings:
     moments: tuple[float, ...] = ()
     filmed: bool = True
     has_loads: bool = False
-    on_support: int = 0
+    support_makes_a_frame: bool = False
     bare: Any = None
 
     @property

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from livedeform.common.experiment.schema import Markers
-from livedeform.common.frames import MAKE_A_FRAME, fit_rigid
+from livedeform.common.frames import fit_rigid, make_a_frame
 from livedeform.common.types import Array, Ids, Wrench
 from livedeform.compare_node.residual import Residual, tabulate
 
@@ -29,8 +29,8 @@ class AtRest:
     frames' and that of the markers' stated places. The model's ``elements`` get the markers wrong by so much.
 
     That motion moves the markers' middle by ``shift`` (m) and turns them by ``turn`` (rad) about it, (3,) each: from
-    where the model has them to where they were measured. So many markers are ``held`` by the support: they tell a body
-    that was held off its rest from a tracker's frame that is off."""
+    where the model has them to where they were measured. So many markers are ``held`` by the support, if they make a
+    frame: they tell a body that was held off its rest from a tracker's frame that is off."""
 
     end: str
     n: int
@@ -67,7 +67,7 @@ class AtRest:
         if not self.contradicts:
             return found
         shift, turn = (", ".join(f"{1e3 * v:+.2f}" for v in motion) for motion in (self.shift, self.turn))
-        where = "" if self.held >= MAKE_A_FRAME else ", where the tracker's frame does not come from these markers"
+        where = "" if self.held else ", where the tracker's frame does not come from these markers"
         return (
             f"{found}: the reference pose contradicts the model, or the model the body; the motion is ({shift}) mm of "
             f"the markers' middle and ({turn}) mrad about it; diagnose tests reference_pose{where}"
@@ -116,7 +116,8 @@ def _at_end(residuals: Sequence[Residual | None], markers: Markers, end: str) ->
     if len(still) < SHORTEST or _span_ns(still) < SPAN_NS:
         return None
     ids, predicted, error, frame = _means(still)
-    held = markers.ids[np.asarray(markers.kinds) == "support"]
+    on_support = np.asarray(markers.kinds) == "support"
+    held = markers.ids[on_support]
     free = ~np.isin(ids, held)
     if free.sum() < 3:
         return None
@@ -131,7 +132,8 @@ def _at_end(residuals: Sequence[Residual | None], markers: Markers, end: str) ->
     size = [float(np.sqrt(np.mean(np.sum(e**2, axis=1)))) for e in (error, error - left, left)]
     shift, turn = (moved - predicted).mean(axis=0), Rotation.from_matrix(T[:3, :3]).as_rotvec()
     moved_by = _three(shift), _three(turn)
-    return AtRest(end, len(ids), len(still), size[0], size[1], size[2], noise, *moved_by, held=len(held))
+    n_held = len(held) if make_a_frame(markers.points[on_support]) else 0
+    return AtRest(end, len(ids), len(still), size[0], size[1], size[2], noise, *moved_by, held=n_held)
 
 
 def _motion(predicted: Array, measured: Array, noise: float) -> Array:

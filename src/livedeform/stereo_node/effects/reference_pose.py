@@ -8,7 +8,6 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from livedeform.common.effect import EffectInfo, Parameter, Surroundings
-from livedeform.common.frames import MAKE_A_FRAME
 from livedeform.common.types import Array
 from livedeform.stereo_node.effects.view import View
 
@@ -16,7 +15,7 @@ from livedeform.stereo_node.effects.view import View
 def _possible(around: Surroundings) -> bool:
     """Return whether a tracker's frame is known without the markers at rest, or by those on the support: cameras that
     are registered to the others take a rigid displacement of these upon themselves."""
-    return not around.has_cameras or around.on_support >= MAKE_A_FRAME
+    return not around.has_cameras or around.support_makes_a_frame
 
 
 INFO = EffectInfo(
