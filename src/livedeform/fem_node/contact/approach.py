@@ -65,8 +65,9 @@ class Touchable(Protocol):
 
 
 def hangs(contact: Touchable) -> bool:
-    """Return whether the surface may hang on the probe's edges: they are sharper than elements of this size bend."""
-    return contact.shape.roundness < ROUND * contact.facet_size
+    """Return whether the surface may hang on the probe's edges: they are sharper than elements of this size bend, or
+    how sharp they are is not known (NaN)."""
+    return not contact.shape.roundness >= ROUND * contact.facet_size
 
 
 @dataclass(frozen=True)
@@ -95,7 +96,9 @@ class Approach:
         before[:3, 3] -= self.deepest * moment.pose[:3, 2]
         known = start.pose is not None and not self._held_between(x, start.pose, moment.pose)
         straight = [[moment]] if known or self.admissible(x, before, moment.pose) else []
-        if stays and straight:
+        if stays:
+            if not straight:
+                raise _no_way("the probe rubs or sticks, and its way leads through what holds the body")
             return straight
         if not self._held_between(x, outside, moment.pose):
             if anew and self.slid(came, moment.pose):

@@ -299,7 +299,9 @@ class ProbeContact(PlainItem):
             if points.tangential is not None:
                 t = points.tangential.traction
                 slides = np.linalg.norm(t, axis=1) >= (1.0 - 1e-9) * state.limit[i]
-                anchor = _put(anchor, i[slides], points.y[slides])
+                # a penalty's friction is what its spring bears, which stays stretched by it
+                stretched = 0.0 if self.law.multiplies else t[slides] / self.law.penalty
+                anchor = _put(anchor, i[slides], points.y[slides] + stretched)
                 limit[i], multiplier_t[i] = state.limit[i], np.where(slides[:, None], t, state.multiplier_t[i])
         self.state = ContactState(
             np.where(loaded, state.multiplier, 0.0),
@@ -319,7 +321,7 @@ class ProbeContact(PlainItem):
 
     def ways(self, x: Array, start: Moment, moment: Moment) -> Sequence[Sequence[Moment]]:
         """Straight from where the probe was, or from outside along its axis; only straight where it rubs or sticks."""
-        stays = self.drags and bool(self.state.touches.any())
+        stays = self.drags and bool((self.state.touches | self.state.attached).any())
         return self.approach.ways(x, start, moment, self.state.came, anew=self.approaches, stays=stays)
 
     def furthest(self, x: Array, start: Moment, moment: Moment, done: float) -> float:
