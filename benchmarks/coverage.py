@@ -265,7 +265,7 @@ def fitted_given(method: ForwardSelection, candidate: Candidate) -> tuple[Fitted
     fits = [f for f in (method.fitter.refit(last.problem, model) for model in tried) if f is not None]
     model = max(fits, key=_gain_of, default=tried[0])
     model = method.mesh.corrected(last.problem, model, method.settings.passes)
-    return method.settle(method.freed(last.problem, model)), last.problem
+    return method.settle(last.problem, method.freed(last.problem, model))
 
 
 def _gain_of(model: FittedModel) -> float:

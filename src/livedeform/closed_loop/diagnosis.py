@@ -131,7 +131,10 @@ class Diagnosis:
 
     @property
     def next_recording(self) -> NextRecording | None:
-        """Expect another recording's errors, where two or more were held out."""
+        """Expect another recording's errors, where two or more were held out whole: parts of those that were fitted
+        were registered and laid down with them."""
+        if {o.name for o in self.held_out} & {o.name for o in self.selection.observations}:
+            return None
         return next_recording(self.errors_before, self.errors_after)
 
     @property

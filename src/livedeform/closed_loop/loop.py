@@ -176,7 +176,7 @@ def most_effects(inputs: Inputs) -> int:
 def check_touched(inputs: Inputs, found: Selection) -> None:
     """Refuse recordings in which the probe touches nothing, by the model's motion."""
     if found.first is not None:
-        motion = motion_of(np.nan_to_num(found.first.run.points), inputs.fitted)
+        motion = motion_of(found.first.run.points, inputs.fitted)
         check_contact(inputs.fitted, motion, inputs.settings)
 
 
@@ -273,7 +273,7 @@ def left_over(inputs: Inputs, rule: Earning, predicted: Predicted, *, seed: int)
     for."""
     run, observations, settings = stack(predicted.runs), inputs.held_out, inputs.settings
     problem = rule.problem(predicted)
-    motion = motion_of(np.nan_to_num(run.points), observations)
+    motion = motion_of(run.points, observations)
     seconds, rates = (np.concatenate([getattr(o, name) for o in observations]) for name in ("seconds", "rates"))
     blocks = blocks_of(observations)
     basis = smooth_basis(problem.rows, inputs.places, motion, rates, blocks, seconds, settings.discrepancy)

@@ -227,7 +227,8 @@ def visible(found: Selection, threshold: float, settings: Settings) -> Visible:
     linearised, and from which size on it matters: ``threshold`` m at most."""
     if found.first is None:
         return Visible({}, threshold)
-    motion = motion_of(np.nan_to_num(found.first.run.points), found.observations)
+    points = found.first.run.points
+    motion = motion_of(points, found.observations)[np.isfinite(points).all(axis=(1, 2))]
     floor = float(np.mean([np.nan_to_num(o.noise.value) for o in found.observations]))
     matters = size_that_matters(motion, threshold, floor / np.sqrt(motion.size), settings.verdict.matters)
     if not found.candidates:

@@ -166,17 +166,20 @@ def in_common(one: Sequence[Run], two: Sequence[Run]) -> tuple[list[Run], list[R
 
 
 def _to_rest_of(o: Observation, run: Run) -> Array:
-    """The transform (4, 4) that moves the markers before the first press to where the run has them, weighted by their
-    noise as the tracker's own registration is: by millimetres alone depth, which two cameras see several times worse,
-    would turn what they see sideways."""
-    moving = np.flatnonzero(o.phases != "rest")
-    n_rest = max(1, int(moving[0]) if len(moving) else len(o.phases))
-    measured, predicted = o.points[:n_rest], run.points[:n_rest]
+    """The transform (4, 4) that moves the markers at rest to where the run has them, weighted by their noise as the
+    tracker's own registration is: by millimetres alone depth, which two cameras see several times worse, would turn
+    what they see sideways. At rest is what is before the first press; in a part of a recording that begins in one,
+    what is after it, and where there is none nothing is moved: what is pressed would take the model's errors upon
+    itself."""
+    at_rest = o.phases == "rest"
+    if at_rest[0]:
+        at_rest = np.logical_and.accumulate(at_rest)
+    measured, predicted = o.points[at_rest], run.points[at_rest]
     both = np.isfinite(measured).all(axis=2) & np.isfinite(predicted).all(axis=2)
     if both.sum() < 3:
         return np.eye(4)
     start = frames.fit_rigid(measured[both], predicted[both])
-    return frames.fit_misplaced(measured[both], o.covariances[:n_rest][both], predicted[both], start)
+    return frames.fit_misplaced(measured[both], o.covariances[at_rest][both], predicted[both], start)
 
 
 @dataclass(frozen=True)

@@ -136,7 +136,7 @@ def _motion_over(n: int, data: Track, variance: Array, noise: NoiseReport, setti
     n = min(n, max(len(y), 1))
     rest = median(y[:n])
     d2 = np.nansum((y - rest) ** 2, axis=2)
-    seen = np.isfinite(y).all(axis=2)
+    seen = np.isfinite(y - rest).all(axis=2)  # a marker whose rest was not seen does not tell how far it is
     weight = seen / variance
     count, n_seen = weight.sum(axis=1), seen.sum(axis=1)
     trust = count / n_seen.clip(min=1)  # one where all that was seen is as usual

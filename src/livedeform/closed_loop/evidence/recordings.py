@@ -16,6 +16,7 @@ from livedeform.closed_loop.progress import Tell
 from livedeform.closed_loop.settings import SamplingSettings, Settings
 from livedeform.common.bags.recording import Recording, recording_name
 from livedeform.common.checks.exchanged import exchanges_in
+from livedeform.common.checks.presses import shows_the_body
 from livedeform.common.errors import RecordingError
 from livedeform.common.experiment.yaml_file import Experiment
 from livedeform.common.types import Array, Image, MarkerFrame, Pose
@@ -56,7 +57,7 @@ def read_evidence(
         frames, note = marker_frames(experiment, recording, rest, settings.sampling, tell)
         named, exchanged = with_own_ids(track(frames, experiment.markers.ids), exchanges_in(frames), rest)
         notes += [f"{name}: {text}" for text in (*recording.warnings, *note, *exchanged)]
-        seen = without(named, recording.start_ns, release, sigma, sampling.letting_go)
+        seen = since_seen(without(named, recording.start_ns, release, sigma, sampling.letting_go))
         observed = observe(
             name,
             seen,
@@ -93,6 +94,13 @@ def without(data: Track, start_ns: int, release: float, sigma: float, within: tu
     late = 1e-9 * (data.stamps_ns - start_ns) - release
     keep = (sigma == 0.0) | (late < sigma * within[0]) | (late > sigma * within[1])
     return Track(data.stamps_ns[keep], data.ids, data.points[keep], data.covariances[keep])
+
+
+def since_seen(data: Track) -> Track:
+    """Leave out the frames before the first one that shows the body: where it is at rest is told by those that follow,
+    as `livedeform info` does (`common.checks.presses.rest_places`)."""
+    first = int(np.argmax(shows_the_body(np.isfinite(data.points).all(axis=2).sum(axis=1)))) if len(data.points) else 0
+    return Track(data.stamps_ns[first:], data.ids, data.points[first:], data.covariances[first:])
 
 
 def in_sequence(observations: Sequence[Observation]) -> list[Observation]:

@@ -222,7 +222,7 @@ class ForwardSelection:
             model, fitted_in, notes = self.revised(fitted_in, model)
             model = self.freed(fitted_in, model)
             steps = steps + [SelectionStep(steps[-1].screening, {}, name, note) for name, note in notes]
-        model = self.settle(model)
+            model, fitted_in = self.settle(fitted_in, model)
         fitted = {*model.names, *(name for step in steps for name in step.refined)}
         lost = tuple(name for name in dict.fromkeys(self.lost) if name not in fitted)
         return Selection(self.observations, self.candidates, model, tuple(steps), first, last, fitted_in, lost)
@@ -617,26 +617,26 @@ class ForwardSelection:
         fit = self.fitter.method.last_step(model.joint, problem.marginal, prior, before)
         return None if fit is None else model.with_fit(fit)
 
-    def settle(self, model: FittedModel) -> FittedModel:
+    def settle(self, problem: Problem, model: FittedModel) -> tuple[FittedModel, Problem]:
         """Fit again with the derivatives of what is allowed for in each press anew taken where an added effect of its
-        own kind has led: a probe that is deeper touches more."""
+        own kind has led: a probe that is deeper touches more. Also returns the problem on the rows of the fit."""
         own = {a.candidate.name for a in model.uncertain.always if a.per_press}
         if model.joint is None or not own & set(model.names):
-            return model
+            return model, problem
         for _ in range(self.settings.passes):
             if not self.budget.allows("fitting all together once more"):
                 break
             self.tell("fitting all together", None)
-            problem = self.restated(model, self.problems_of(model))
-            again = self.fitter.refit(problem, model)
+            restated = self.restated(model, self.problems_of(model))
+            again = self.fitter.refit(restated, model)
             if again is None or again.joint is None or model.joint is None:
-                return model
+                break
             settled = again.joint.has_settled(model.joint)
-            model = again
+            model, problem = again, restated
             if settled:
-                return model
+                break
             model = self.mesh.corrected(problem, model, passes=1)
-        return model
+        return model, problem
 
     def _is_too_small(self, r: Refined) -> bool:
         """Tell whether the least of it that the model can be solved with is far worse than nothing, and no way leads

@@ -250,13 +250,16 @@ def probe_of(observations: Sequence[Observation]) -> Array:
 
 
 def motion_of(points: Array, observations: Sequence[Observation]) -> Array:
-    """Return how far each predicted marker is from its place at the recording's moment of rest (k, m) m."""
+    """Return how far each predicted marker is from its place at the recording's moments of rest (k, m) m; 0 at a moment
+    without an equilibrium, of which nothing is known."""
     out, at = np.zeros(points.shape[:2]), 0
     for o in observations:
         part = points[at : at + o.n_moments]
-        rest = np.flatnonzero(o.phases == "rest")
-        origin = part[rest].mean(axis=0) if len(rest) else part[0]
-        out[at : at + o.n_moments] = np.linalg.norm(part - origin, axis=2)
+        solved = np.isfinite(part).all(axis=(1, 2))
+        rest = solved & (o.phases == "rest")
+        if solved.any():
+            origin = part[rest].mean(axis=0) if rest.any() else part[solved][0]
+            out[at : at + o.n_moments][solved] = np.linalg.norm(part[solved] - origin, axis=2)
         at += o.n_moments
     return out
 

@@ -118,7 +118,7 @@ def next_recording(diagnosis: Mapping[str, Any]) -> str:
     """Say what is expected of another recording, as far as those that were held out tell."""
     found = diagnosis.get("next_recording")
     if not isinstance(found, Mapping):
-        return "Another recording: one that was held out does not say how recordings differ."
+        return "Another recording: two that were held out whole would say how recordings differ, one does not."
     (low, high), gain = found["error_after_rmse"], found["improvement"]
     digits = decimals(low, high)
     return (
