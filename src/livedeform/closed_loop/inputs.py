@@ -93,7 +93,7 @@ def read_inputs(
     # 2. the model on a mesh that the search can afford, and how the cameras see it
     body, rest = _body(experiment, recordings, len(fit), settings, tell)
     # 3. the evidence: what was measured, at key moments
-    evidence = read_evidence(experiment, recordings, len(fit), rest, settings, tell)
+    evidence = read_evidence(experiment, recordings, len(fit), body.setting.views, settings, tell)
     tell("looking whether each moment has one answer", None)
     doubts = doubtful(body, [*evidence.fitted, *evidence.held_out])
     # 4. the candidates that can act here

@@ -13,6 +13,7 @@ import toy
 from toy_loop import PLACES, toy_inputs
 
 from livedeform.closed_loop.candidates import catalogue
+from livedeform.closed_loop.evidence import recordings
 from livedeform.closed_loop.evidence.observation import Observation, observe
 from livedeform.closed_loop.evidence.recordings import names_of, read_evidence, split
 from livedeform.closed_loop.evidence.track import track
@@ -119,8 +120,9 @@ def test_blocks_that_have_no_moment_have_no_number(presses: int) -> None:
     assert len(np.unique(held_out.blocks)) >= 2 and len(np.unique(fitted.blocks)) >= 2
 
 
-def test_recordings_of_one_name_have_what_is_declared_for_it() -> None:
-    """The second of two bags called alike was diagnosed with the gravity of all others."""
+def test_recordings_of_one_name_have_what_is_declared_for_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The second of two bags called alike was diagnosed with the gravity of all others; and cameras were registered to
+    where markers rest without what acts in their recording, which the sag between the two made an effect of."""
     asked: list[str] = []
     acting = SimpleNamespace(timeline=SimpleNamespace(release=0.0), sigma=lambda _: None)
     experiment = SimpleNamespace(
@@ -134,8 +136,18 @@ def test_recordings_of_one_name_have_what_is_declared_for_it() -> None:
     seen = frames(toy.path(), seconds=3.0)
     recorded = {"uncorrected_marker_frames": seen, "warnings": [], "start_ns": 0, "wrenches": [], "poses": []}
     own = [SimpleNamespace(own_name="upside_down", **recorded) for _ in paths]
-    read_evidence(experiment, dict(zip(names, own, strict=True)), 1, PLACES, toy.SETTINGS, lambda *_: None)  # type: ignore[arg-type]
+    views = {name: SimpleNamespace(rest=PLACES + 1e-3 * k) for k, name in enumerate(names)}
+    registered: list[tuple[object, np.ndarray]] = []
+    measured = recordings.marker_frames
+
+    def noted(of: object, recording: object, rest: np.ndarray, *how: object) -> object:
+        registered.append((of, rest))
+        return measured(of, recording, rest, *how)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(recordings, "marker_frames", noted)
+    read_evidence(experiment, dict(zip(names, own, strict=True)), 1, views, toy.SETTINGS, lambda *_: None)  # type: ignore[arg-type]
     assert asked == ["upside_down", "upside_down"]
+    assert all(of is acting and rest is views[name].rest for name, (of, rest) in zip(names, registered, strict=True))
 
 
 def test_candidates_that_cannot_act_are_said() -> None:

@@ -20,6 +20,7 @@ from livedeform.common.checks.presses import shows_the_body
 from livedeform.common.errors import RecordingError
 from livedeform.common.experiment.yaml_file import Experiment
 from livedeform.common.types import Array, Image, MarkerFrame, Pose
+from livedeform.stereo_node.effects.view import View
 from livedeform.stereo_node.pairing import recorded_pairs
 from livedeform.stereo_node.pipeline import StereoTracker
 
@@ -40,12 +41,11 @@ def read_evidence(
     experiment: Experiment,
     recordings: Mapping[str, Recording],
     n_fit: int,
-    rest: Array,
+    views: Mapping[str, View],
     settings: Settings,
     tell: Tell,
 ) -> Evidence:
-    """Observe the ``recordings``, the first ``n_fit`` to be fitted; ``rest`` (m, 3) m are the markers' places at
-    rest."""
+    """Observe the ``recordings``, the first ``n_fit`` to be fitted; the ``views`` have where markers rest in each."""
     observations, notes = [], []
     sampling = settings.sampling
     for number, (name, recording) in enumerate(recordings.items()):
@@ -54,7 +54,8 @@ def read_evidence(
         release, sigma = acting.timeline.release, acting.sigma("timeline.release") or 0.0
         if release > 0.0:
             n_moments = max(n_moments, sampling.moments_swing)
-        frames, note = marker_frames(experiment, recording, rest, settings.sampling, tell)
+        rest = views[name].rest
+        frames, note = marker_frames(acting, recording, rest, settings.sampling, tell)
         named, exchanged = with_own_ids(track(frames, experiment.markers.ids), exchanges_in(frames), rest)
         notes += [f"{name}: {text}" for text in (*recording.warnings, *note, *exchanged)]
         seen = since_seen(without(named, recording.start_ns, release, sigma, sampling.letting_go))
