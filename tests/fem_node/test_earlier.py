@@ -111,7 +111,7 @@ def test_key_poses_follow_the_path_in_place_and_time():
 def test_recordings_that_cannot_have_been_before_are_refused(tmp_path):
     a, b = bag(tmp_path / "a.mcap", press(0)), bag(tmp_path / "b.mcap", press(10))
     empty = bag(tmp_path / "empty.mcap", [])
-    assert [len(poses) for poses in earlier_poses([a, b], 20 * SECOND)] == [60, 60]
+    assert [len(poses) for poses in earlier_poses([a, b], 20 * SECOND, 0.0)] == [60, 60]
     assert bags_of(joined([a, b])) == [a, b] and bags_of("") == []
     for bags, start, text in (
         ([a, b], 12, "b.mcap: is not earlier than the recording that is run"),
@@ -120,4 +120,10 @@ def test_recordings_that_cannot_have_been_before_are_refused(tmp_path):
         ([empty], 20, "has no probe poses"),
     ):
         with pytest.raises(InputError, match=text):
-            earlier_poses(bags, start * SECOND)
+            earlier_poses(bags, start * SECOND, 0.0)
+
+
+def test_a_body_that_is_let_go_has_gone_through_nothing_before():
+    """It was let go once, in the first of the earlier recordings: at the start of the run it hung already."""
+    with pytest.raises(InputError, match=r"held again before each recording.*--after|--after.*held again"):
+        earlier_poses([Path("a.mcap")], 0, 1.0)

@@ -224,7 +224,7 @@ def _before_it_begins(
     options: RunOptions, experiment: Experiment, draft: Path, start_ns: int, ran_of: Source
 ) -> list[Take]:
     """Write the experiment, and refuse unfit bags and runs before there is anything to lose; gives the other takes."""
-    earlier_poses(options.after, start_ns)
+    earlier_poses(options.after, start_ns, experiment.timeline.release)
     keep_experiment(experiment, draft)
     if options.repeats and not ran_of.whole:
         remedy = "run the whole recording, or leave --repeat out"
@@ -443,7 +443,7 @@ def live(
     session is ready.
     """
     experiment = load_experiment(experiment_path)
-    earlier_poses(after, time.time_ns())
+    earlier_poses(after, time.time_ns(), experiment.timeline.release)
     options = {"experiment": experiment_path, "out": out, "nodes": list(names), "after": list(after)}
     about = outputs.configuration("live", options | {"expected": expected})
     inputs = [*files_of(experiment), *after, expected]

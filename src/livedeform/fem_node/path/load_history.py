@@ -48,9 +48,16 @@ def joined(bags: Sequence[Path]) -> str:
     return json.dumps([str(bag) for bag in bags]) if bags else ""
 
 
-def earlier_poses(bags: Sequence[Path], start_ns: int) -> list[list[Pose]]:
+def earlier_poses(bags: Sequence[Path], start_ns: int, release: float) -> list[list[Pose]]:
     """Return the poses of each of ``bags`` (the earliest first); ``InputError`` where one has none, or is not over when
-    the next begins, or when the recording that begins at ``start_ns`` does (0: not known)."""
+    the next begins, or when the recording that begins at ``start_ns`` does (0: not known), and of a body that is let go
+    at a ``release`` (s) after each recording's start: the model lets go once."""
+    if bags and release > 0.0:
+        raise InputError(
+            "a body that is let go is held again before each recording, which the model does not follow",
+            where=f"--after {bags[0]}",
+            remedy="leave --after out, or timeline.release where the body is not let go",
+        )
     out: list[list[Pose]] = []
     for bag in bags:
         poses = load_poses(bag)
@@ -81,7 +88,7 @@ def pass_earlier(
 ) -> PhantomModel:
     """Return the model, which has gone through the recordings ``bags`` (the earliest first) as far as it remembers
     that."""
-    recordings = earlier_poses(bags, start_ns)
+    recordings = earlier_poses(bags, start_ns, model.physics.release)
     if not recordings:
         return model
     if not remembers_for_good(model.physics):
