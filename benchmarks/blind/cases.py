@@ -211,6 +211,12 @@ def scaled(effect: Mapping[str, Any], size: float) -> dict[str, Any]:
     return {"name": name, **values}
 
 
+def nothing_at(spec: Mapping[str, Any]) -> dict[str, float]:
+    """Return the values of parameters at which effects do nothing in a scenario, those that are not here at 0: a scan
+    is taken to be loaded, or unloaded."""
+    return NEUTRAL | ({"fraction": 1.0} if spec["declared"].get("configuration") == "loaded" else {})
+
+
 def end_at_balls(spec: dict[str, Any]) -> None:
     """Let the elements of a scenario's truth end where its inclusion does, if it is a block."""
     for ball in spec["truth"]:

@@ -25,9 +25,11 @@ SEVERAL_NUMBERS = ("gravity_tilt", "camera_motion", "probe_offset")  # effects o
 STIFFNESSES = ("base_slip",)  # effects that are the larger the less their number is
 
 
-def predicted(effects: Sequence[Mapping[str, Any]], found: Mapping[str, Any]) -> float:
-    """Return the probability with which a diagnosis says that it would see a single true effect of one number; NaN if
-    it says nothing of it."""
+def predicted(
+    effects: Sequence[Mapping[str, Any]], found: Mapping[str, Any], nothing: Mapping[str, float] = NEUTRAL
+) -> float:
+    """Return the probability with which a diagnosis says that it would see a single true effect of one number, by how
+    far from ``nothing`` it is; NaN if it says nothing of it."""
     rows = found["candidates"]
     visible = {row["name"]: row["detectable"] for row in rows if "detectable" in row}
     if len(effects) != 1 or effects[0]["name"] not in visible or not any(visible.values()):
@@ -37,18 +39,18 @@ def predicted(effects: Sequence[Mapping[str, Any]], found: Mapping[str, Any]) ->
         return float("nan")
     if not visible[name]:  # null beside others that are not: no size that it can have
         return 0.0
-    ratio = times_visible(effects[0], visible[name])
+    ratio = times_visible(effects[0], visible[name], nothing)
     settings = Settings()
     alone = 1.0 - (1.0 - settings.selection.alpha) ** (1.0 / len(rows))
     level, power = norm.isf(alone / 2.0), norm.ppf(settings.verdict.power)
     return float(norm.cdf(ratio * (level + power) - level))
 
 
-def times_visible(effect: Mapping[str, Any], visible: float) -> float:
+def times_visible(effect: Mapping[str, Any], visible: float, nothing: Mapping[str, float] = NEUTRAL) -> float:
     """Return how many times as large a true effect is as the one that is ``visible``, by its first parameter's
     difference from no effect; by that of its logarithm where the search fits that."""
     name = next(key for key in effect if key != "name")
-    value, none = float(np.ravel(effect[name])[0]), NEUTRAL.get(name, 0.0)
+    value, none = float(np.ravel(effect[name])[0]), nothing.get(name, 0.0)
     if effect["name"] in STIFFNESSES:
         return visible / value
     parameter = next(p for p in all_effects()[effect["name"]].parameters if p.name == name)

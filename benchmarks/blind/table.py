@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from scipy.stats import beta
 
-from benchmarks.blind.cases import NEUTRAL, Case
+from benchmarks.blind.cases import NEUTRAL, Case, nothing_at
 from benchmarks.blind.detection import curve, predicted
 from livedeform.common.types import Array
 
@@ -94,8 +94,17 @@ def score(case: Case, out: Path) -> Score | None:
         seconds=seconds,
         baselines=_baselines(found, result.get("baselines")),
         strength=float(result.get("size_over_noise", "nan")),
-        expected=predicted(case.scenario()["truth"], found),
+        expected=_expected(case, found),
     )
+
+
+def _expected(case: Case, found: Mapping[str, Any]) -> float:
+    """Return the probability with which a diagnosis says that it would see the truth; NaN where a part of it is
+    declared, of which what would be seen is a difference."""
+    spec = case.scenario()
+    if spec["declared"].get("effects"):
+        return float("nan")
+    return predicted(spec["truth"], found, nothing_at(spec))
 
 
 def _alternatives(found: Mapping[str, Any], named: Sequence[str]) -> tuple[str, ...]:
@@ -125,17 +134,21 @@ def _baselines(found: Mapping[str, Any], said: Mapping[str, Any] | None) -> Mapp
 def _accuracy(case: Case, found: Mapping[str, Any]) -> tuple[list[float], list[bool]]:
     """Relative errors of all fitted numbers that are known, and whether their intervals hold the truth."""
     errors, covered = [], []
-    for true in case.scenario()["truth"]:
+    spec = case.scenario()
+    for true in spec["truth"]:
         for effect in found["effects"]:
             if effect["name"] == true["name"]:
-                e, c = compare(true, effect["parameters"])
+                e, c = compare(true, effect["parameters"], nothing_at(spec))
                 errors += e
                 covered += c
     return errors, covered
 
 
-def compare(true: Mapping[str, Any], parameters: Mapping[str, Any]) -> tuple[list[float], list[bool]]:
-    """Return the relative errors of an effect's numbers, and whether their intervals hold the ``true`` ones."""
+def compare(
+    true: Mapping[str, Any], parameters: Mapping[str, Any], nothing: Mapping[str, float] = NEUTRAL
+) -> tuple[list[float], list[bool]]:
+    """Return the errors of an effect's numbers, relative to how far from ``nothing`` the ``true`` ones are, and whether
+    their intervals hold these."""
     errors, covered = [], []
     for name, fitted in parameters.items():
         if name not in true:
@@ -145,7 +158,7 @@ def compare(true: Mapping[str, Any], parameters: Mapping[str, Any]) -> tuple[lis
             continue
         angle = name == "direction" and t.size == 1  # the same after a turn, and without a size to be wrong by
         t = t + 2.0 * np.pi * np.round((v - t) / (2.0 * np.pi)) if angle else t
-        size = 0.0 if angle else float(np.linalg.norm(t - NEUTRAL.get(name, 0.0)))
+        size = 0.0 if angle else float(np.linalg.norm(t - nothing.get(name, 0.0)))
         if size > 0.0:
             errors.append(float(np.linalg.norm(v - t)) / size)
         sigma = np.atleast_1d(np.asarray(fitted["sigma"], float))

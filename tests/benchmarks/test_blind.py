@@ -153,6 +153,16 @@ def test_an_angle_is_the_same_after_a_turn_and_has_no_size_to_be_wrong_by():
     assert compare(true, {"direction": {"value": 0.3, "sigma": 0.05}})[1] == [False]
 
 
+def test_the_size_of_an_effect_is_how_far_it_is_from_nothing() -> None:
+    """A scan is taken to be loaded: the true share of gravity is 0.84 for 1. It was counted from 0."""
+    spec = blind_cases.Case("s", "single", (blind_cases.sized("scan_gravity", 2.0),), 2.0, 1).scenario()
+    (true,), nothing = spec["truth"], blind_cases.nothing_at(spec)
+    assert spec["declared"]["configuration"] == "loaded" and true["fraction"] == pytest.approx(0.84)
+    errors, covered = compare(true, {"fraction": {"value": 0.92, "sigma": 0.05}}, nothing)
+    assert errors == pytest.approx([0.5]) and covered == [True]
+    assert times_visible(true, 0.16, nothing) == pytest.approx(1.0)
+
+
 def test_the_table_judges_as_the_issue_asks(tmp_path: Path) -> None:
     cases = [
         blind_cases.Case("n0", "none", (), 0.0, 0),

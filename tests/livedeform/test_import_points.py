@@ -3,6 +3,7 @@ named."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -93,6 +94,9 @@ def test_a_preview_writes_nothing_and_a_take_left_out_is_named(track: np.ndarray
 def test_the_release_is_where_points_begin_to_move(track: np.ndarray, tmp_path: Path):
     take, _ = read_take([written(tmp_path, track)["wide"]], Understanding())
     assert 1.0 <= take.seconds[release_frame(take)] < 1.12  # 60 um are fallen 0.03 s later, 6 sigma in z
+    lost = take.points.copy()
+    lost[int(np.searchsorted(take.seconds, 1.6))] = np.nan  # trackers lose points while they swing: that is no rest
+    assert release_frame(replace(take, points=lost)) == release_frame(take)
     still, _ = read_take([written(tmp_path, track)["wide"]], Understanding(crop=(0.0, 0.9)))
     with pytest.raises(InputError, match="nothing tells rest from movement"):
         release_frame(still)

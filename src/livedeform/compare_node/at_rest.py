@@ -150,7 +150,8 @@ def _span_ns(still: Sequence[Residual]) -> int:
 
 def _means(still: Sequence[Residual]) -> tuple[Ids, Array, Array, Array]:
     """Return the ids (n,) of markers that at least half of the frames show, their mean prediction and error (n, 3) m,
-    and the variance (n,) m2 per axis of their mean: that of one frame, as frames may not be independent."""
+    and the variance (n,) m2 per axis of their mean: that of one frame, as frames may not be independent. Of a marker
+    whose tracker states none it is how its errors scatter."""
     table = tabulate(list(still))
     ids, row, count = np.unique(table.ids, return_inverse=True, return_counts=True)
     often = 2 * count >= len(still)
@@ -159,8 +160,11 @@ def _means(still: Sequence[Residual]) -> tuple[Ids, Array, Array, Array]:
         columns = [np.bincount(row, column) / count for column in values.reshape(len(row), -1).T]
         return np.stack(columns, axis=1)[often]
 
-    variance = np.nan_to_num(mean(np.nan_to_num(table.variances)))[:, 0] / 3.0
-    return ids[often], mean(table.predicted), mean(table.errors), variance
+    error, known = mean(table.errors), np.isfinite(table.variances)
+    scatter = np.maximum(mean(table.errors**2) - error**2, 0.0).sum(axis=1) * (count / np.maximum(count - 1, 1))[often]
+    share = mean(1.0 * known)[:, 0]  # of the frames, in which it is stated
+    stated = mean(np.where(known, table.variances, 0.0))[:, 0] / np.where(share > 0.0, share, 1.0)
+    return ids[often], mean(table.predicted), error, np.where(share > 0.0, stated, scatter) / 3.0
 
 
 def _moved(one: Residual, other: Residual) -> float:

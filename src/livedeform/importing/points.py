@@ -183,8 +183,10 @@ def release_frame(take: MotionCapture, rest_s: float = REST_BEFORE) -> int:
         raise InputError("too few frames before to tell rest", where="--release", remedy="say --release SECONDS")
     noise = np.nanstd(rest, axis=0)
     away = np.abs(take.points - np.nanmedian(rest, axis=0)) > MOVES * np.fmax(noise, 1e-6)
-    moving = np.nanmean(away.any(axis=2), axis=1) > 0.3  # of the points
-    still = np.flatnonzero(~moving)
+    seen = np.isfinite(take.points).all(axis=2).sum(axis=1)
+    moving = away.any(axis=2).sum(axis=1) > 0.3 * seen  # of the points that are seen
+    told = seen >= 0.5 * np.median(seen)  # by points that are lost nobody knows whether the body moves
+    still = np.flatnonzero(~moving & told)
     first = int(still[-1]) + 1 if len(still) and still[-1] + 1 < len(moving) else len(moving)
     first = int(np.argmax(moving)) if moving.any() and first == len(moving) else first
     if not moving.any() or first < len(rest):

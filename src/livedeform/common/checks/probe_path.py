@@ -7,6 +7,7 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
@@ -18,7 +19,8 @@ from livedeform.common.types import Array, Pose
 
 N_SAMPLES = 20_000  # of the surface
 SEED = 7  # of where they lie
-MOST_POSES = 400  # looked at, spread evenly over the recording
+MOST_POSES = 400  # looked at, spread evenly over the recording, and as many that are nearest to the body between them
+MOST_LOOKS = 200_000  # at where poses are, to find these
 TOUCH = 1e-3  # m: the body sags, and the samples are apart, by about that
 FAR = 2.0  # of the body's diagonal: a probe that stays that far away is in another frame or unit
 BACKWARDS = -0.5  # cosine between the probe's +z and the direction to the body: it looks away from it
@@ -120,14 +122,45 @@ def _too_far(recording: Recording, experiment: Experiment, body: Surface, deepes
 
 
 def probe_path(poses: list[Pose], shape: ProbeShape, body: Surface, start_ns: int) -> ProbeApproach:
-    """Return the probe's path past the body, at up to `MOST_POSES` of the poses, the last and the first among them."""
-    rows = np.unique(np.linspace(0, len(poses) - 1, min(len(poses), MOST_POSES)).round().astype(int))
+    """Return the probe's path past the body at some of the poses: the last and the first, the deepest and the first
+    that touches are among them."""
+    distance, face = SurfaceDistance(body), face_points(shape)
+    rows = _nearest(poses, distance)
+    path = _path_at(poses, rows, distance, face, body, start_ns)
+    touching = np.flatnonzero(path.depths > 0.0)
+    if not len(touching) or touching[0] == 0:
+        return path
+    first = _evenly(rows[touching[0] - 1], rows[touching[0]])
+    return _path_at(poses, np.union1d(rows, first), distance, face, body, start_ns)
+
+
+def _evenly(first: int, last: int, most: int = MOST_POSES) -> NDArray[np.int64]:
+    """Return numbers between two, these among them, of which there are at most so many."""
+    return np.unique(np.linspace(first, last, min(last - first + 1, most)).round().astype(np.int64))
+
+
+def _nearest(poses: list[Pose], distance: SurfaceDistance) -> NDArray[np.int64]:
+    """Return the numbers of some of the poses: spread evenly, and between them the one that is deepest in the body."""
+    rows = _evenly(0, len(poses) - 1)
+    if len(rows) == len(poses):
+        return rows
+    looked = _evenly(0, len(poses) - 1, MOST_LOOKS)
+    depths = distance(np.array([poses[i].position for i in looked]))
+    part = np.searchsorted(rows, looked, side="right")
+    by_depth = np.lexsort((depths, part))
+    deepest = by_depth[np.flatnonzero(np.diff(part[by_depth], append=part[by_depth[-1]] + 1))]
+    return np.union1d(rows, looked[deepest])
+
+
+def _path_at(
+    poses: list[Pose], rows: NDArray[np.int64], distance: SurfaceDistance, face: Array, body: Surface, start_ns: int
+) -> ProbeApproach:
+    """Return the path at the poses number ``rows`` (n,)."""
     chosen = [poses[i] for i in rows]
-    face = face_points(shape)
     turns = Rotation.from_quat([pose.orientation_xyzw for pose in chosen])
     origins = np.array([pose.position for pose in chosen])
     points = np.array([turn.apply(face) for turn in turns]) + origins[:, None]
-    depths = SurfaceDistance(body)(points.reshape(-1, 3)).reshape(points.shape[:2]).max(axis=1)
+    depths = distance(points.reshape(-1, 3)).reshape(points.shape[:2]).max(axis=1)
     to_body = 0.5 * (body.lower + body.upper) - origins
     axes = turns.apply([0.0, 0.0, 1.0])
     length = np.maximum(np.linalg.norm(to_body, axis=1), 1e-12)

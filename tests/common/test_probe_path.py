@@ -1,0 +1,35 @@
+"""When the probe touches and how deep it goes, in recordings of any length."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import trimesh
+
+from livedeform.common.checks.probe_path import probe_path
+from livedeform.common.experiment.schema import ProbeShape
+from livedeform.common.experiment.surface import Surface
+from livedeform.common.types import Pose
+
+BLOCK = trimesh.creation.box((0.08, 0.06, 0.045))
+BLOCK.apply_translation((0.0, 0.0, 0.0225))
+BODY = Surface(np.asarray(BLOCK.vertices, float), np.asarray(BLOCK.faces, np.int64))
+DOWN = np.array([1.0, 0.0, 0.0, 0.0])
+
+
+@pytest.mark.parametrize("minutes", [1, 15, 30])
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_short_press_is_seen_in_a_long_recording(minutes: int, seed: int) -> None:
+    """Of poses 4.5 s apart, of half an hour, one in seven recordings with presses never touched the body."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(0.0, 60.0 * minutes, 0.02)
+    begins = np.sort(rng.uniform(0.1, 0.9, 3)) * t[-1]
+    depth = np.full(len(t), -0.005)
+    for begin in begins:
+        depth += 0.011 * np.clip(np.minimum(t - begin, begin + 2.0 - t) / 0.5, 0.0, 1.0) * (depth < 0.0)
+    poses = [Pose(int(1e9 * s), np.array([0.0, 0.0, 0.045 - d]), DOWN) for s, d in zip(t, depth, strict=True)]
+    path = probe_path(poses, ProbeShape(sphere=0.02), BODY, 0)
+    assert path.depths.max() == pytest.approx(depth.max(), abs=2e-5)
+    assert path.seconds[np.argmax(path.depths > 0.0)] == pytest.approx(t[np.argmax(depth > 0.0)], abs=0.05)
+    assert (path.seconds[0], path.seconds[-1]) == (0.0, pytest.approx(t[-1]))
+    assert len(path.seconds) < 1300 and (np.diff(path.seconds) > 0.0).all()
