@@ -338,6 +338,17 @@ def unsolved_notes(which: str, runs: Sequence[Run]) -> list[str]:
     return [f"{lost.sum()} of {len(lost)} {which} moments are left out: no equilibrium was found there{why}"]
 
 
+def lost_with_effects(found: Selection) -> list[str]:
+    """Say how many of the moments that were fitted the model has no equilibrium for with the effects in it."""
+    if found.first is None or found.problem is None or not found.added:
+        return []
+    before, after = (np.unique(problem.rows.moment) for problem in (found.first.problem, found.problem))
+    lost, n = len(np.setdiff1d(before, after)), sum(o.n_moments for o in found.observations)
+    if not lost:
+        return []
+    return [f"{lost} of {n} fitted moments are left out: no equilibrium was found there with the effects"]
+
+
 def aside_notes(run: Run | None) -> list[str]:
     """Name the candidates that could not be screened."""
     found = {} if run is None else run.aside

@@ -56,6 +56,7 @@ from livedeform.closed_loop.diagnosis import (
     held_out_notes,
     left_doubts,
     lost_doubts,
+    lost_with_effects,
     noise_notes,
     noise_reasons,
     odd_marker_doubts,
@@ -400,6 +401,7 @@ def _doubts(assessed: Assessed, given: HeldOutRuns, settings: VerdictSettings) -
     first = assessed.found.first
     return (
         *unsolved_notes("fitted", [] if first is None else [first.run]),
+        *lost_with_effects(assessed.found),
         *unsolved_notes("held-out", given.after),
         *aside_notes(None if first is None else first.run),
         *fit_notes(assessed.tested.model.joint, assessed.found.problem, settings),

@@ -167,6 +167,7 @@ class ForwardSelection:
         steps: list[SelectionStep] = []
         first: Linearised | None = None
         last: Linearised | None = None
+        fitted: Linearised | None = None  # where the model was: a step that adds nothing is taken about it
         too_small: frozenset[str] = frozenset()
         for number in range(self.max_effects + 1):
             if number and not self.has_time(model, number):
@@ -201,25 +202,33 @@ class ForwardSelection:
             # 5. add the best one and fit all together; what a release shows takes the place of what was found so far
             model, last, new = self.released_soon(self.extended(last.problem, model, best), last)
             # 6. number each as the data ask for, and correct for the discretisation error with it
-            model = self.numbered(last.problem, model)
-            model = self.mesh.corrected(last.problem, model, self.settings.passes)
+            model = self.mesh.corrected(last.problem, self.numbered(last.problem, model), self.settings.passes)
+            fitted = last
             steps.append(SelectionStep(screened, refined, best.candidate.name, _why(best, able)))
             steps += [SelectionStep(screened, {}, name, TOGETHER) for name in new]
             if len(model.added) >= self.max_effects:
                 steps += self.at_limit(model, self.prescreen(model, last))
                 break
         # 7. number otherwise what rings, take out what is needless, take what is allowed for where the effects have led
-        return self.finished(model, steps, first, last)
+        return self.finished(model, steps, first, last, fitted)
 
     # -- parts -------------------------------------------------------------------------------------------------------
 
     def finished(
-        self, model: FittedModel, steps: list[SelectionStep], first: Linearised | None, last: Linearised | None
+        self,
+        model: FittedModel,
+        steps: list[SelectionStep],
+        first: Linearised | None,
+        last: Linearised | None,
+        where: Linearised | None,
     ) -> Selection:
-        """Return what was found, revised and settled."""
-        fitted_in = None if last is None else last.problem
+        """Return what was found, revised and settled: all in the problem ``where`` it was fitted, whose rows and whose
+        gain are the fit's."""
+        stated = where or last
+        fitted_in = None if stated is None else stated.problem
         if fitted_in is not None:
             model, fitted_in, notes = self.revised(fitted_in, model)
+            model, fitted_in = self.without_lost(fitted_in, model)
             model = self.freed(fitted_in, model)
             steps = steps + [SelectionStep(steps[-1].screening, {}, name, note) for name, note in notes]
             model, fitted_in = self.settle(fitted_in, model)
@@ -586,6 +595,23 @@ class ForwardSelection:
             model = self.mesh.corrected(problem, again, self.settings.passes)
             notes.append(f"{name} is not needed given the others: taken out")
         return model, notes
+
+    def without_lost(self, problem: Problem, model: FittedModel) -> tuple[FittedModel, Problem]:
+        """Fit again without the moments that have no equilibrium with the effects. A fit keeps there what was left
+        before, so that nothing is gained by it; but errors of place and registration tie that to other moments, and
+        draw what is fitted towards nothing. Also returns the problem on the rows of the fit."""
+        if model.joint is None:
+            return model, problem
+        points = stack(self.fitter.forward.run(model.effects, self.observations)).points
+        lost = np.asarray(np.isnan(points).any(axis=(1, 2)))
+        if not lost[problem.rows.moment].any():
+            return model, problem
+        self.tell("fitting without the moments that are lost", None)
+        restated = self.restated(model, self.problems_of(model))
+        again = self.fitter.refit(restated, model)
+        if again is None or again.joint is None:
+            return model, problem
+        return self.mesh.corrected(restated, again, passes=1), restated
 
     def freed(self, problem: Problem, model: FittedModel) -> FittedModel:
         """Take the last step of the fit, with priors that hold nothing back (`unhindered`); where these change more
