@@ -150,3 +150,28 @@ def test_frames_before_the_body_is_seen_are_no_rest() -> None:
     )
     hidden = replace(track, points=np.full_like(points, np.nan))
     assert len(since_seen(hidden).points) == n
+
+
+def test_a_candidate_that_is_lost_at_presses_is_not_judged_by_the_rest() -> None:
+    """Its own run ends where the probe presses: its rmse was 0.39 mm of the moments at rest, for 0.43 of all."""
+
+    class NoColumn(toy.ToyModel):
+        def run(
+            self, effects: Sequence[EffectValues], observations: Sequence[Observation], columns: Sequence[Column] = ()
+        ) -> list[Run]:
+            out = super().run(effects, observations, columns)
+            for o, run in zip(observations, out, strict=True):
+                own = [c.candidate.name == "stiffness" for c in columns]
+                run.d_points[np.ix_(o.phases != "rest", *map(np.arange, run.d_points.shape[1:3]), own)] = np.nan
+            return out
+
+    stiffer, body = [toy.effect("strain_stiffening", b=2.0)], toy.ToyBody(PLACES)
+    fit, test = (
+        toy.record(stiffer, seed=s, body=body, name=name, n=n) for s, name, n in ((0, "fit", 36), (1000, "test", 24))
+    )
+    inputs = toy_inputs(fit, test, ("stiffness", "strain_stiffening"))
+    whole, lost = (
+        next(r.test_rmse for r in investigate(m, inputs, seed=0).ranking if r.name == "stiffness")
+        for m in (toy.ToyModel(body), NoColumn(body))
+    )
+    assert lost > whole  # measured 0.518 and 0.430 mm

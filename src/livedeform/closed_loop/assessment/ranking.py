@@ -148,7 +148,7 @@ class Ranking:
         for s, end in zip(self.linear, ends, strict=True):
             theta = s.fit.theta
             pick = list(range(end - len(theta), end))
-            out[s.name] = [
-                Run(r.points + r.d_points[..., pick] @ theta, r.forces, r.d_points[..., :0], None) for r in before
-            ]
+            # where its own run was lost it does nothing, as in screening: all are told of the same moments
+            moved = [r.points + np.nan_to_num(r.d_points[..., pick]) @ theta for r in before]
+            out[s.name] = [Run(p, r.forces, r.d_points[..., :0], None) for p, r in zip(moved, before, strict=True)]
         return out
