@@ -67,7 +67,7 @@ def test_a_moment_that_is_lost_is_no_motion_of_centimetres() -> None:
     assert lost.matters == pytest.approx(whole.matters, rel=0.03)  # measured 0.7 %
 
 
-@pytest.mark.parametrize("test", [1, 2])
+@pytest.mark.parametrize("test", [pytest.param(1, marks=pytest.mark.slow), 2])
 def test_moments_that_are_lost_hide_no_residual(test: int) -> None:
     """It was `none` with two of them, p 0.97 beside a chi2 of 2.6 per datum; p is 3e-17 now."""
     found = diagnosed(1e-4, ("time_offset", "poisson_ratio"), test=test, detail=0.12)
@@ -95,7 +95,7 @@ def test_values_are_stated_on_the_moments_of_their_fit() -> None:
     np.testing.assert_allclose(*sigmas, rtol=0.05)  # measured 0.4 %
 
 
-@pytest.mark.parametrize("detail", [0.0, 0.15])
+@pytest.mark.parametrize("detail", [pytest.param(0.0, marks=pytest.mark.slow), 0.15])
 @pytest.mark.parametrize("how", ["unless", "only"])
 def test_moments_that_are_lost_with_an_effect_do_not_draw_it_to_nothing(how: str, detail: float) -> None:
     """One of 36: b was 1.78 for 2.0, since what was left there before stayed in the fit. With a detail that nothing
