@@ -78,8 +78,8 @@ def _size(folder: Path, case: Case, truth: str) -> dict[str, float]:
     """Measure a case's effects over the noise: by the loop's model, or by a second truth without them if it does not
     know them."""
     if not set(case.truth) & set(OUTSIDE):
-        truth_of = case.scenario()["truth"]  # which may differ from the case's effects: a scan that is loaded
-        return {"size_over_noise": size_over_noise(folder / "experiment", folder / "bags" / "a", truth_of)}
+        true = case.scenario()["truth"]  # which may differ from the case's effects: a scan that is loaded
+        return {"size_over_noise": size_over_noise(folder / "experiment", folder / "bags" / "a", true)}
     with tempfile.TemporaryDirectory() as plain:
         make(case.scenario() | {"truth": []}, Path(plain), case.seed, mesher=mesh_to_file, solver=TRUTHS[truth])
         return {"size_over_noise": size_of_truth(folder, Path(plain))}

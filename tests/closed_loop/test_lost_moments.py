@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import pytest
 import toy
-from toy_loop import PLACES, toy_inputs
+from toy_loop import PLACES, recorded, toy_inputs
 
 from livedeform.closed_loop.diagnosis import Diagnosis
 from livedeform.closed_loop.evidence.observation import Observation
@@ -46,17 +46,12 @@ class Lost(toy.ToyModel):
 def diagnosed(sigma: float, names: Sequence[str], fit: int = 0, test: int = 0, detail: float = 0.0) -> Diagnosis:
     """Diagnose a body without an effect, or with a ``detail`` that no candidate describes; so many of the deepest
     moments are lost."""
-    body, lost = toy.ToyBody(PLACES, detail), {"fit": fit, "test": test}
-    recorded = [
-        toy.record([], seed=s, body=body, name=name, n=n, sigma=sigma)
-        for s, name, n in ((0, "fit", 36), (1000, "test", 24))
-    ]
+    lost, both = {"fit": fit, "test": test}, recorded([], sigma=sigma, detail=detail)
     at = {
-        o.name: frozenset(int(s) for s in o.stamps_ns[o.deepest(lost[o.name] + 3)[1 : 1 + lost[o.name]]])
-        for o in recorded
+        o.name: frozenset(int(s) for s in o.stamps_ns[o.deepest(lost[o.name] + 3)[1 : 1 + lost[o.name]]]) for o in both
     }
     model = Lost(toy.ToyBody(PLACES), at=at)
-    return investigate(model, toy_inputs(*recorded, names), seed=0)
+    return investigate(model, toy_inputs(*both, names), seed=0)
 
 
 def test_a_moment_that_is_lost_is_no_motion_of_centimetres() -> None:
@@ -78,10 +73,7 @@ def test_values_are_stated_on_the_moments_of_their_fit() -> None:
     """A moment is lost but with the effect, which is also allowed for in each press: the last problem that was stated
     is that of the fit. By an earlier one presses that disagree widened no interval."""
     offset = [toy.effect("probe_offset", translation=[1e-3, -5e-4, 1e-3])]
-    body = toy.ToyBody(PLACES)
-    fit, test = (
-        toy.record(offset, seed=s, body=body, name=name, n=n) for s, name, n in ((0, "fit", 36), (1000, "test", 24))
-    )
+    body, (fit, test) = toy.ToyBody(PLACES), recorded(offset)
     inputs = toy_inputs(fit, test, ("probe_offset", "gravity_tilt"))
     allowed = Allowed(inputs.candidates["probe_offset"], np.array([2e-4, 2e-4, 1e-4]), per_press=True)
     inputs = replace(inputs, uncertain=replace(inputs.uncertain, always=(allowed,)))
@@ -102,10 +94,7 @@ def test_moments_that_are_lost_with_an_effect_do_not_draw_it_to_nothing(how: str
     describes another step is taken in vain, whose rows are not those of the fit: intervals were 3 times too narrow, or
     an index was out of bounds."""
     stiffer = [toy.effect("strain_stiffening", b=2.0)]
-    fit, test = (
-        toy.record(stiffer, seed=s, body=toy.ToyBody(PLACES, detail), name=name, n=n)
-        for s, name, n in ((0, "fit", 36), (1000, "test", 24))
-    )
+    fit, test = recorded(stiffer, detail=detail)
     inputs = toy_inputs(fit, test, ("strain_stiffening", "density"))
     at = {"fit": frozenset([int(fit.stamps_ns[fit.deepest(4)[1]])])}
     body = toy.ToyBody(PLACES)
@@ -165,11 +154,8 @@ def test_a_candidate_that_is_lost_at_presses_is_not_judged_by_the_rest() -> None
                 run.d_points[np.ix_(o.phases != "rest", *map(np.arange, run.d_points.shape[1:3]), own)] = np.nan
             return out
 
-    stiffer, body = [toy.effect("strain_stiffening", b=2.0)], toy.ToyBody(PLACES)
-    fit, test = (
-        toy.record(stiffer, seed=s, body=body, name=name, n=n) for s, name, n in ((0, "fit", 36), (1000, "test", 24))
-    )
-    inputs = toy_inputs(fit, test, ("stiffness", "strain_stiffening"))
+    body, both = toy.ToyBody(PLACES), recorded([toy.effect("strain_stiffening", b=2.0)])
+    inputs = toy_inputs(*both, ("stiffness", "strain_stiffening"))
     whole, lost = (
         next(r.test_rmse for r in investigate(m, inputs, seed=0).ranking if r.name == "stiffness")
         for m in (toy.ToyModel(body), NoColumn(body))

@@ -35,6 +35,16 @@ def toy_inputs(
     )
 
 
+def recorded(
+    effects: list[EffectValues], seed: int = 0, *, sigma: float = 1e-4, detail: float = 0.0
+) -> tuple[Observation, Observation]:
+    """Record a toy body with these effects twice: to fit, and to hold out."""
+    body = toy.ToyBody(PLACES, detail)
+    fit = toy.record(effects, seed=seed, body=body, name="fit", n=36, sigma=sigma)
+    test = toy.record(effects, seed=seed + 1000, body=body, name="test", n=24, sigma=sigma)
+    return fit, test
+
+
 def closed(
     effects: list[EffectValues],
     seed: int = 0,
@@ -46,8 +56,5 @@ def closed(
     budget: TimeBudget | None = None,
 ) -> Diagnosis:
     """Diagnose a toy recording with these undeclared effects, and one held out."""
-    body = toy.ToyBody(PLACES, detail)
-    fit = toy.record(effects, seed=seed, body=body, name="fit", n=36, sigma=sigma)
-    test = toy.record(effects, seed=seed + 1000, body=body, name="test", n=24, sigma=sigma)
-    inputs = toy_inputs(fit, test, names, settings)
+    inputs = toy_inputs(*recorded(effects, seed, sigma=sigma, detail=detail), names, settings)
     return investigate(toy.ToyModel(toy.ToyBody(PLACES)), inputs, seed=seed, budget=budget)

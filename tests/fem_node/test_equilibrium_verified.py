@@ -253,20 +253,18 @@ def test_friction_is_dragged_along_on_the_way():
     np.testing.assert_allclose(fast.force, slow.force, rtol=0.02, atol=2e-3)
 
 
-# -- verification, state by state --------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("law", [{"friction": 0.8}, {"adhesion": 300.0}, {}])
 def test_what_rubs_or_sticks_is_not_lifted_where_its_way_is_lost(law, monkeypatch):
     """A slide whose straight way is lost has no answer: pressed anew from above, a probe has dragged nothing along:
     sideways its force was -0.02 N instead of 0.08 (a box in a slide of 2 mm). A body without memory has one."""
     settings = replace(SETTINGS, condensed=False)
     body = Mechanics(COARSE, physics(PROBES["ball"], **law), settings=settings)
-    down = np.diag([1.0, -1.0, -1.0, 1.0])
     deepest = 0.0 if "adhesion" in law else 0.002  # pulled: attached, and pressed nowhere
     for k, depth in enumerate((-0.001, 0.001, deepest)):
-        body.advance(Moment(k, np.inf, np.zeros(3), pose=at(down, 0.0, depth)))
+        body.advance(Moment(k, np.inf, np.zeros(3), pose=frames.pose_matrix(pose(k, depth, 0.0))))
     before, along = body.x.copy(), Solver._along
+    if "adhesion" in law:
+        assert body.contact.state.attached.any() and not body.contact.state.touches.any()
 
     def straight_is_lost(self, solution, way, stride):
         if len(way) == 2:
@@ -274,7 +272,7 @@ def test_what_rubs_or_sticks_is_not_lifted_where_its_way_is_lost(law, monkeypatc
         return along(self, solution, way, stride)
 
     monkeypatch.setattr(Solver, "_along", straight_is_lost)
-    aside = Moment(3.0, np.inf, np.zeros(3), pose=at(down, 0.001, deepest))
+    aside = Moment(3.0, np.inf, np.zeros(3), pose=frames.pose_matrix(pose(3, deepest, 0.001)))
     if not law:
         body.advance(aside)
         assert body.wrench()[0][2] < -0.01
@@ -284,11 +282,7 @@ def test_what_rubs_or_sticks_is_not_lifted_where_its_way_is_lost(law, monkeypatc
     assert np.array_equal(body.x, before)
 
 
-def at(turned, x, depth):
-    """Return a pose (4, 4) over the middle of the body's top."""
-    T = turned.copy()
-    T[:3, 3] = x, 0.0, TOP - depth
-    return T
+# -- verification, state by state --------------------------------------------------------------------------------------
 
 
 def touched(**changes):

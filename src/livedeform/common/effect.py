@@ -56,8 +56,7 @@ class Surroundings:
     known are there if it ``has_cameras``; it is ``filmed`` if there are any. The recordings last ``duration`` s; the
     probe touched at ``contacts`` (c, 3) m and was accelerated by ``jolt`` m/s2 at most; ``moments`` (k,) s are the key
     moments after the drifts' clock's start. The body ``has_loads`` if something besides its weight loads it in some
-    recording. ``bare``: the physics without the effects
-    that the experiment has (None: it has none).
+    recording. ``bare``: the physics without the effects that the experiment has (None: it has none).
     """
 
     physics: Any

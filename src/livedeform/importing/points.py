@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 import livedeform
+from livedeform.common.checks.presses import shows_the_body
 from livedeform.common.errors import InputError, LivedeformError, RecordingError
 from livedeform.common.experiment.schema import Markers
 from livedeform.common.experiment.yaml_file import files_of, load_experiment
@@ -185,8 +186,8 @@ def release_frame(take: MotionCapture, rest_s: float = REST_BEFORE) -> int:
     away = np.abs(take.points - np.nanmedian(rest, axis=0)) > MOVES * np.fmax(noise, 1e-6)
     seen = np.isfinite(take.points).all(axis=2).sum(axis=1)
     moving = away.any(axis=2).sum(axis=1) > 0.3 * seen  # of the points that are seen
-    told = seen >= 0.5 * np.median(seen)  # by points that are lost nobody knows whether the body moves
-    still = np.flatnonzero(~moving & told)
+    # by points that are lost nobody knows whether the body moves
+    still = np.flatnonzero(~moving & shows_the_body(seen))
     first = int(still[-1]) + 1 if len(still) and still[-1] + 1 < len(moving) else len(moving)
     first = int(np.argmax(moving)) if moving.any() and first == len(moving) else first
     if not moving.any() or first < len(rest):

@@ -291,7 +291,7 @@ def _with_poses(name: str, data: Track, poses: Sequence[Pose]) -> tuple[Track, A
             remedy="record poses more often" if inside.sum() >= 2 else "check the clocks' stamps",
         )
     position, _ = poses_at(poses, data.stamps_ns)
-    return Track(data.stamps_ns[told], data.ids, data.points[told], data.covariances[told]), position[told]
+    return data.take(told), position[told]
 
 
 def _in_gaps(stamps_ns: np.ndarray, poses: Sequence[Pose]) -> np.ndarray:

@@ -94,14 +94,14 @@ def without(data: Track, start_ns: int, release: float, sigma: float, within: tu
     at the body, and the model lets go at once. With a sigma of 0 all stay."""
     late = 1e-9 * (data.stamps_ns - start_ns) - release
     keep = (sigma == 0.0) | (late < sigma * within[0]) | (late > sigma * within[1])
-    return Track(data.stamps_ns[keep], data.ids, data.points[keep], data.covariances[keep])
+    return data.take(keep)
 
 
 def since_seen(data: Track) -> Track:
     """Leave out the frames before the first one that shows the body: where it is at rest is told by those that follow,
     as `livedeform info` does (`common.checks.presses.rest_places`)."""
-    first = int(np.argmax(shows_the_body(np.isfinite(data.points).all(axis=2).sum(axis=1)))) if len(data.points) else 0
-    return Track(data.stamps_ns[first:], data.ids, data.points[first:], data.covariances[first:])
+    shown = shows_the_body(np.isfinite(data.points).all(axis=2).sum(axis=1))
+    return data.take(np.logical_or.accumulate(shown))
 
 
 def in_sequence(observations: Sequence[Observation]) -> list[Observation]:

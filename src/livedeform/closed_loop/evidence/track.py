@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -20,6 +20,12 @@ class Track:
     ids: np.ndarray
     points: Array
     covariances: Array
+
+    def take(self, keep: np.ndarray) -> Track:
+        """Some of the frames (f,) bool."""
+        return replace(
+            self, stamps_ns=self.stamps_ns[keep], points=self.points[keep], covariances=self.covariances[keep]
+        )
 
     def over_usual(self, most: float) -> Array:
         """Find the variance (f, m) that the tracker states of each frame's point, over that of the marker's median

@@ -607,10 +607,10 @@ class ForwardSelection:
         if not lost[problem.rows.moment].any():
             return model, problem
         self.tell("fitting without the moments that are lost", None)
-        restated = self.restated(model, self.problems_of(model))
-        again = self.fitter.refit(restated, model)
-        if again is None or again.joint is None:
+        anew = self._anew(model)
+        if anew is None:
             return model, problem
+        again, restated = anew
         return self.mesh.corrected(restated, again, passes=1), restated
 
     def freed(self, problem: Problem, model: FittedModel) -> FittedModel:
@@ -653,16 +653,21 @@ class ForwardSelection:
             if not self.budget.allows("fitting all together once more"):
                 break
             self.tell("fitting all together", None)
-            restated = self.restated(model, self.problems_of(model))
-            again = self.fitter.refit(restated, model)
-            if again is None or again.joint is None or model.joint is None:
+            before, anew = model.joint, self._anew(model)
+            if anew is None or before is None:
                 break
-            settled = again.joint.has_settled(model.joint)
-            model, problem = again, restated
-            if settled:
+            model, problem = anew
+            if model.joint is None or model.joint.has_settled(before):
                 break
             model = self.mesh.corrected(problem, model, passes=1)
         return model, problem
+
+    def _anew(self, model: FittedModel) -> tuple[FittedModel, Problem] | None:
+        """Fit again in the problem stated at the model as it is, and return that too; None where it cannot be solved
+        there."""
+        problem = self.restated(model, self.problems_of(model))
+        again = self.fitter.refit(problem, model)
+        return None if again is None or again.joint is None else (again, problem)
 
     def _is_too_small(self, r: Refined) -> bool:
         """Tell whether the least of it that the model can be solved with is far worse than nothing, and no way leads

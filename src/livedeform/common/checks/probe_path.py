@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import Any
 
@@ -130,8 +130,11 @@ def probe_path(poses: list[Pose], shape: ProbeShape, body: Surface, start_ns: in
     touching = np.flatnonzero(path.depths > 0.0)
     if not len(touching) or touching[0] == 0:
         return path
-    first = _evenly(rows[touching[0] - 1], rows[touching[0]])
-    return _path_at(poses, np.union1d(rows, first), distance, face, body, start_ns)
+    between = np.setdiff1d(_evenly(rows[touching[0] - 1], rows[touching[0]]), rows)
+    if not len(between):
+        return path
+    first, at = _path_at(poses, between, distance, face, body, start_ns), int(touching[0])
+    return ProbeApproach(*(np.insert(getattr(path, f.name), at, getattr(first, f.name)) for f in fields(ProbeApproach)))
 
 
 def _evenly(first: int, last: int, most: int = MOST_POSES) -> NDArray[np.int64]:

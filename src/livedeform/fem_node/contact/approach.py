@@ -90,8 +90,6 @@ class Approach:
         depth = self.contact.depth_in_held(x, moment.pose)
         if depth > QUICK:
             raise _no_way(f"the probe stands {1e3 * depth:.1f} mm deep in what holds the body")
-        outside = self.outside(x, moment.pose)
-        around = [replace(moment, pose=None), replace(moment, pose=outside), moment]
         before = moment.pose.copy()
         before[:3, 3] -= self.deepest * moment.pose[:3, 2]
         known = start.pose is not None and not self._held_between(x, start.pose, moment.pose)
@@ -100,6 +98,8 @@ class Approach:
             if not straight:
                 raise _no_way("the probe rubs or sticks, and its way leads through what holds the body")
             return straight
+        outside = self.outside(x, moment.pose)
+        around = [replace(moment, pose=None), replace(moment, pose=outside), moment]
         if not self._held_between(x, outside, moment.pose):
             if anew and self.slid(came, moment.pose):
                 return [around]
