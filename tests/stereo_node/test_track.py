@@ -68,6 +68,68 @@ def through_a_dark_second(model_error=None):
     return returned, wrong, used
 
 
+def through_a_pause(points, drag, tracker, begin, width=0.025, seconds=0.5, seed=0):
+    """Markers at ``points`` with normals up, dragged by ``drag`` (3,) m at the middle while no pictures come, held, and
+    let go over two seconds; or ``begin`` so and at rest after the pause. Numbers of wrong ids and published shares."""
+    rig, T = make_test_rig(), looking_down()
+    rng, faces = np.random.default_rng(seed), np.ones(len(points), bool)
+    bump = np.exp(-((points - points.mean(axis=0)) ** 2).sum(axis=1) / (2 * width**2))[:, None]
+    back = [*np.linspace(1.0, 0.0, 30), *[0.0] * 5]
+    course = [*[0.0] * 5, *[1.0] * 5, *back] if begin == "at rest" else [*np.linspace(0, 1, 30), *[0.0] * 5]
+    stamp, wrong, share = 0, [], []
+    for k, amount in enumerate(course):
+        stamp += round(1e9 * (seconds if k == (5 if begin == "at rest" else 30) else 0.066))
+        moved = points + amount * bump * drag
+        pictures = (spots(rig, apply(inverse(T), moved), faces, rng, right=side) for side in (False, True))
+        pairs = candidate_pairs(rig, *pictures, MatchSettings())
+        result = tracker.update(stamp, pairs)
+        rows, names = result.pairs[result.confirmed], result.markers[result.confirmed]
+        off = np.linalg.norm(apply(T, pairs.points.points[rows]) - moved[names], axis=1)
+        wrong.append(int((off > 1.5e-3).sum()))
+        share.append(len(names) / len(points))
+    return wrong, share
+
+
+def grid(n_x=9, n_y=7, spacing=0.008):
+    """A painted grid, whose rows are each other's likeness: points (n, 3) m and the tracker that starts with them."""
+    x, y = np.meshgrid(spacing * (np.arange(n_x) - n_x // 2), spacing * (np.arange(n_y) - n_y // 2))
+    points = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, 0.03)])
+    seen = np.ones(len(points), bool)
+    return points, IdentityTracker(apply(inverse(looking_down()), points), seen, TrackSettings(), 1e-3)
+
+
+@pytest.mark.parametrize("width", [0.015, 0.04])
+@pytest.mark.parametrize("share", [0.3, 0.7, 1.0, 1.3])
+def test_a_grid_that_is_dragged_while_pictures_pause_takes_no_neighbours_ids(share, width):
+    """By its own spacing and about. Without a word all but the rear markers had the next one's id for good."""
+    points, tracker = grid()
+    wrong, seen = through_a_pause(points, share * np.array([0.008, 0.0, 0.0]), tracker, "at rest", width)
+    assert sum(wrong) == 0
+    assert seen[-1] == 1.0  # at rest all are known again
+    assert seen[5] == (1.0 if share < 0.5 else 0.0)
+
+
+def test_after_a_pause_that_began_in_a_press_the_body_may_be_at_rest():
+    points, tracker = grid()
+    wrong, seen = through_a_pause(points, np.array([0.007, 0.0, 0.0]), tracker, "in a press")
+    assert sum(wrong) == 0 and seen[29] == 1.0
+    assert seen[-1] == 1.0
+
+
+def test_a_glint_and_hidden_markers_cost_nothing_after_a_pause():
+    """A spot that is no marker was there before; the probe hides a row meanwhile, and the body moves a little."""
+    points, tracker = grid()
+    rig, T, rng = make_test_rig(), looking_down(), np.random.default_rng(1)
+    glint = np.array([[0.004, 0.004, 0.03]])
+    for k, stamp in enumerate((1, 66_000_001, 666_000_001)):
+        moved = np.vstack([points + (k == 2) * np.array([0.0025, 0.0, 0.0]), glint])
+        faces = np.ones(len(moved), bool)
+        faces[:5] = k < 2
+        pictures = (spots(rig, apply(inverse(T), moved), faces, rng, right=side) for side in (False, True))
+        result = tracker.update(stamp, candidate_pairs(rig, *pictures, MatchSettings()))
+    assert len(result.markers) >= len(points) - 6 and result.confirmed.all()
+
+
 def test_the_models_prediction_finds_markers_that_moved_while_hidden():
     """What the seen markers do not show, the model does: 12 mm sideways, more than the markers' spacing of 9 mm."""
     without, wrong, used = through_a_dark_second()

@@ -352,7 +352,7 @@ def lost_with_effects(found: Selection) -> list[str]:
 def aside_notes(run: Run | None) -> list[str]:
     """Name the candidates that could not be screened."""
     found = {} if run is None else run.aside
-    return [f"set aside: {name} (its run did not converge in {seconds:.0f} s)" for name, seconds in found.items()]
+    return [f"set aside: {name} ({why})" for name, why in found.items()]
 
 
 def rubbing_doubts(model: FittedModel, inputs: Inputs) -> tuple[str, ...]:

@@ -31,8 +31,8 @@ class Run:
     """Predictions of one recording: ``points`` (k, m, 3) m, ``forces`` (k, 3) N or None, and their derivatives
     ``d_points`` (k, m, 3, p), ``d_forces`` (k, 3, p) for the columns asked for. Moments that did not converge are
     NaN; ``reasons`` says why, once each. ``rough``: whether derivatives are only about right, as where the probe rubs:
-    points begin to stick or to slide between two runs. ``aside``: how long (s) the run of its own of each candidate
-    took that did not come to an end, and whose columns are therefore nothing."""
+    points begin to stick or to slide between two runs. ``aside``: why the run of its own of each candidate was of no
+    use whose columns are therefore nothing."""
 
     points: Array
     forces: Array | None
@@ -40,7 +40,7 @@ class Run:
     d_forces: Array | None
     seconds: float = 0.0
     reasons: tuple[str, ...] = ()
-    aside: Mapping[str, float] = field(default_factory=dict)
+    aside: Mapping[str, str] = field(default_factory=dict)
     rough: bool = False
 
     @property
@@ -192,7 +192,7 @@ def stack(runs: Sequence[Run]) -> Run:
         np.concatenate([_or_unknown(r.d_forces, r, r.d_points.shape[3:]) for r in runs]) if with_forces else None,
         sum(r.seconds for r in runs),
         tuple(dict.fromkeys(reason for r in runs for reason in r.reasons)),
-        {name: seconds for r in runs for name, seconds in r.aside.items()},
+        {name: why for r in runs for name, why in r.aside.items()},
         any(r.rough for r in runs),
     )
 

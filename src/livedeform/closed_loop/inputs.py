@@ -115,7 +115,7 @@ def read_inputs(
         reach=_reach(evidence, around, settings),
         notes=(*notes, _accuracy_note(error, settings.allowance)),
         experiment=experiment,
-        forward=FemModel(body.setting, processes, body, settings.screening.own_run),
+        forward=FemModel(body.setting, processes, body, settings.screening.own_run, settings.allowance.lost),
         refined_mesh=None if error is None else error.anew,
         recordings=recordings,
         declared=tuple(experiment.effects),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import phantom
@@ -110,6 +111,29 @@ def test_a_candidate_whose_own_run_does_not_end_is_set_aside():
         assert set(run.aside) == aside
         assert run.d_points[..., 0].any() != ("probe_adhesion" in aside)
         assert np.isfinite(run.points).all() and run.d_points[..., 1].any()
+
+
+@pytest.mark.parametrize("n_lost", [2, 6])
+def test_a_candidate_whose_own_run_is_lost_at_many_moments_is_set_aside(
+    n_lost: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of 17 moments a fifth may be lost: where no equilibrium is, a column of nothing costs a candidate nothing."""
+    o = phantom.moments(list(SECONDS))
+    columns = dictionary_columns([toy.candidates(toy.markers(), ["probe_adhesion"])["probe_adhesion"]])
+    model = FemModel(phantom.setting(2), processes=1, most_lost=0.2)
+    simulate = model.body.simulate
+
+    def loses_moments(effects: list[EffectValues], o: Observation, *more: object, **options: Any) -> Run:
+        run = simulate(effects, o, *more, **options)
+        if any(e.name == "probe_adhesion" for e in effects):
+            run.points[-n_lost:] = np.nan
+        return run
+
+    monkeypatch.setattr(model.body, "simulate", loses_moments)
+    run = model.run([], [o], columns)[0]
+    few = n_lost <= 0.2 * o.n_moments
+    assert run.d_points[:-n_lost].any() == few and np.isfinite(run.points).all()
+    assert run.aside == ({} if few else {"probe_adhesion": "its run finds no equilibrium at 6 of 17 moments"})
 
 
 @pytest.mark.parametrize("processes", [1, 2])

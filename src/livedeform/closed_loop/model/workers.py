@@ -63,10 +63,18 @@ class _Job:
 class FemModel:
     """Runs a `Body` on ``processes`` workers; use it as a context manager. One process runs it here. ``body``: one that
     has solved some of the moments already; the workers start from what it knows. ``own_run``: iterations for a moment,
-    after which the run that gives a candidate its column is given up."""
+    after which the run that gives a candidate its column is given up; ``most_lost``: share of the moments beyond which
+    such a run is of no use."""
 
-    def __init__(self, setting: Setting, processes: int = 2, body: Body | None = None, own_run: float = np.inf) -> None:
-        self.setting, self.processes, self.own_run = setting, processes, own_run
+    def __init__(
+        self,
+        setting: Setting,
+        processes: int = 2,
+        body: Body | None = None,
+        own_run: float = np.inf,
+        most_lost: float = 1.0,
+    ) -> None:
+        self.setting, self.processes, self.own_run, self.most_lost = setting, processes, own_run, most_lost
         self._body = body
         self._workers: list[ProcessPoolExecutor] = []
         self._open = ExitStack()
@@ -111,7 +119,7 @@ class FemModel:
         out = []
         for i, o in enumerate(observations):
             own = [(j, r) for j, r in zip(jobs, found, strict=True) if j.recording == i]
-            out.append(replace(_joined(o, own, columns), rough=bool(columns) and self._rubs(effects)))
+            out.append(replace(_joined(o, own, columns, self.most_lost), rough=bool(columns) and self._rubs(effects)))
         return out
 
     def _plan(
@@ -240,7 +248,9 @@ class FemModel:
         return run
 
 
-def _joined(o: Observation, parts: Sequence[tuple[_Job, Run]], columns: Sequence[Column]) -> Run:
+def _joined(
+    o: Observation, parts: Sequence[tuple[_Job, Run]], columns: Sequence[Column], most_lost: float = 1.0
+) -> Run:
     """Join one run of the recording from its jobs."""
     base = [(j, r) for j, r in parts if not j.secant]
     shape = base[0][1].points.shape[1:]
@@ -262,7 +272,7 @@ def _joined(o: Observation, parts: Sequence[tuple[_Job, Run]], columns: Sequence
             _place(d_points, job, ((run.points - points[job.moments]) / strength)[..., None])
             if run.forces is not None:
                 _place(d_forces, job, ((run.forces - forces[job.moments]) / strength)[..., None])
-    aside = _set_aside(parts, columns)
+    aside = _set_aside(np.asarray(np.isfinite(points).all(axis=(1, 2))), parts, columns, most_lost)
     for i, column in enumerate(columns):
         if column.candidate.name in aside:
             d_points[..., i] = d_forces[..., i] = 0.0
@@ -273,13 +283,23 @@ def _joined(o: Observation, parts: Sequence[tuple[_Job, Run]], columns: Sequence
     return Run(points, forces, d_points, d_forces, seconds, reasons, aside)
 
 
-def _set_aside(parts: Sequence[tuple[_Job, Run]], columns: Sequence[Column]) -> dict[str, float]:
-    """Return the candidates whose own run was given up, and how long (s) it took."""
-    out: dict[str, float] = {}
+def _set_aside(
+    solved: np.ndarray, parts: Sequence[tuple[_Job, Run]], columns: Sequence[Column], most_lost: float
+) -> dict[str, str]:
+    """Return the candidates whose own run was given up, or is lost at more than the share ``most_lost`` of what the
+    model without them has ``solved`` (k,) bool, and which of both: they would answer for nothing there."""
+    own: dict[str, list[tuple[_Job, Run]]] = {}
     for job, run in parts:
-        if job.secant and any(NOT_ENOUGH in reason for reason in run.reasons):
-            name = columns[job.columns[0]].candidate.name
-            out[name] = out.get(name, 0.0) + run.seconds
+        if job.secant:
+            own.setdefault(columns[job.columns[0]].candidate.name, []).append((job, run))
+    out = {}
+    for name, runs in own.items():
+        moments = np.concatenate([job.moments[~np.isfinite(run.points).all(axis=(1, 2))] for job, run in runs])
+        lost = len(np.unique(moments[solved[moments]]))
+        if any(NOT_ENOUGH in reason for _, run in runs for reason in run.reasons):
+            out[name] = f"its run did not converge in {sum(run.seconds for _, run in runs):.0f} s"
+        elif lost > most_lost * solved.sum():
+            out[name] = f"its run finds no equilibrium at {lost} of {int(solved.sum())} moments"
     return out
 
 

@@ -4,11 +4,14 @@ Every marker is predicted: where it was, carried on by its velocity while it is 
 neighbours' displacement while it is not (the body is continuous, so the displacement field is smooth). Markers that
 were just seen take their points first, by one global assignment; what they leave may belong to markers that come
 back. A returning marker is taken only when no other marker explains the point nearly as well, and it is published
-from its second sighting on. A doubt costs a marker for some frames; it never swaps two.
+from its second sighting on. A doubt costs a marker for some frames; it never swaps two. After a pause between the
+pictures a whole patch may have moved to its neighbours' places: then points are left over in front of it and markers
+behind, and nothing is published until the body is again as it was before the pause, or at rest.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -19,6 +22,7 @@ from livedeform.stereo_node.track.match import Pairs, assign
 
 Rows = NDArray[np.int64]
 MIN_NEIGHBOURS = 8
+AFTER_A_PAUSE = "identity in doubt after a pause"  # why none of these is published
 
 
 @dataclass(frozen=True)
@@ -38,6 +42,8 @@ class TrackSettings:
     confirm: int = 2  # sightings before a returning marker is published
     forgive: int = 2  # frames in a row that a marker may be missed without having to be confirmed again
     forget_seconds: float = 0.3  # after which a velocity says nothing any more
+    moved_share: float = 0.25  # of the distance to the next marker, beyond which it may have moved to the next's place
+    row: int = 3  # markers that a patch leaves behind, whatever they moved
 
 
 @dataclass(frozen=True)
@@ -71,6 +77,7 @@ class IdentityTracker:
         self.ever_seen = seen.copy()
         self.stamp_ns: int | None = None
         self._n_by_model = 0
+        self._left_over = np.zeros((0, 3))  # points of the last frame that are no marker's
         distance = np.linalg.norm(rest[:, None] - rest[None], axis=2)
         np.fill_diagonal(distance, np.inf)
         self.spacing = distance.min(axis=1) if len(rest) > 1 else np.full(len(rest), np.inf)
@@ -154,23 +161,57 @@ class IdentityTracker:
         """
         if names is not None:
             return self._update_named(stamp_ns, pairs, names)
-        position, sigma = self.predict(stamp_ns, model)
-        n_by_model = self._n_by_model
-        markers, rows, doubtful = self._assign(pairs, position, sigma)
-        smooth = self._smooth(pairs, markers, rows, position)
-        markers, rows = markers[smooth], rows[smooth]
         first = self.stamp_ns is None
-        self._advance(stamp_ns, markers, pairs.points.points[rows])
-        left_over = len(np.unique(pairs.left[_untouched(pairs, rows)]))
+        for position, sigma in self._expected(stamp_ns, model):
+            markers, rows, doubtful = self._assign(pairs, position, sigma)
+            smooth = self._smooth(pairs, markers, rows, position)
+            points, untouched = pairs.points.points, _untouched(pairs, rows[smooth])
+            if not self._moved_on(stamp_ns, markers[smooth], points[rows[smooth]], position, points[untouched]):
+                break
+        else:
+            nobody = np.zeros(0, np.int64)
+            return Tracked(nobody, nobody, np.zeros(0, bool), {AFTER_A_PAUSE: len(markers)})
+        n_by_model, self._left_over = self._n_by_model, points[untouched]
+        markers, rows = markers[smooth], rows[smooth]
+        self._advance(stamp_ns, markers, points[rows])
         # at first nothing went before that could be mistaken
         confirmed = (self.sightings[markers] >= self.settings.confirm) | first
         rejected = {
-            "no marker there": left_over,
+            "no marker there": len(np.unique(pairs.left[untouched])),
             "identity in doubt": doubtful,
             "does not move with its neighbours": int((~smooth).sum()),
             "waits for a second sighting": int((~confirmed).sum()),
         }
         return Tracked(markers, rows, confirmed, {k: v for k, v in rejected.items() if v}, n_by_model)
+
+    def _expected(self, stamp_ns: int, model: Array | None) -> Iterator[tuple[Array, Array]]:
+        """Yield where markers (m, 3) may be, and the sigmas (m,) of that: after a pause the body may be at rest."""
+        position, sigma = self.predict(stamp_ns, model)
+        yield position, sigma
+        if self._paused(stamp_ns):
+            yield self.rest, sigma
+
+    def _paused(self, stamp_ns: int) -> bool:
+        """Tell whether the last picture is so long ago that markers may be anywhere."""
+        return self.stamp_ns is not None and (stamp_ns - self.stamp_ns) * 1e-9 > self.settings.forget_seconds
+
+    def _moved_on(self, stamp_ns: int, markers: Rows, points: Array, position: Array, left_over: Array) -> bool:
+        """Tell whether, after a pause, the ``points`` (n, 3) of ``markers`` (n,) may be their neighbours': new points
+        are ``left_over`` (k, 3) among them and markers are missing, which lost ones do not account for.
+
+        A patch that moved by more than half its spacing is found one marker further, but for its front and rear.
+        """
+        s, fresh = self.settings, self.fresh
+        if not self._paused(stamp_ns) or not fresh.any():
+            return False
+        missing = fresh & ~np.isin(np.arange(len(fresh)), markers)
+        spacing = float(np.median(self.spacing[fresh]))
+        near = _nearest(left_over, position[fresh]) < 1.5 * spacing
+        seen_before = _nearest(left_over, np.vstack([self._left_over, position[~fresh]])) < 0.5 * spacing
+        n_new = int((near & ~seen_before).sum())
+        moved = np.linalg.norm(points - position[markers], axis=1) > s.moved_share * self.spacing[markers]
+        n = min(int(missing.sum()), n_new)
+        return n >= s.row or (n > 0 and bool((moved & fresh[markers]).any()))
 
     def _update_named(self, stamp_ns: int, pairs: Pairs, names: Rows) -> Tracked:
         rows = np.flatnonzero(names >= 0)
@@ -301,6 +342,11 @@ def _assign_apart(cost: Array, pairs: Pairs, limit: float) -> tuple[Rows, Rows]:
 def _total(cost: Array, rows: Rows, cols: Rows, limit: float) -> float:
     """Return cost of an assignment, with ``limit`` for every row that is left alone."""
     return float(cost[rows, cols].sum() + limit * (len(cost) - len(rows)))
+
+
+def _nearest(points: Array, places: Array) -> Array:
+    """Return how far (n,) the ``points`` (n, 3) are from the nearest of the ``places`` (k, 3), inf without any."""
+    return np.asarray(np.linalg.norm(points[:, None] - places[None], axis=2).min(axis=1, initial=np.inf))
 
 
 def _untouched(pairs: Pairs, rows: Rows) -> NDArray[np.bool_]:
