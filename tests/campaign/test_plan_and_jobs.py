@@ -57,6 +57,45 @@ def test_neither_the_folder_of_bags_nor_results_beside_it_are_recordings(source:
     ]
 
 
+def test_a_pattern_of_bags_fits_no_results(source: Path, tmp_path: Path) -> None:
+    """Begun a second time, a campaign counted its own runs as further takes, and told causes of them."""
+    home = source / "phantom-00"
+    (source / "campaign.yaml").write_text("recordings:\n- {experiment: phantom-00, bags: ['phantom-00/**/*']}\n")
+    wanted = [r.name for r in read_plan(source, home / "out")[1]]
+    assert wanted == ["phantom-00/take-00", "phantom-00/take-01"]
+    for name, command in (("out/jobs/a/run", ""), ("why/proposal", ""), ("why", "diagnose"), ("live", "live")):
+        (home / name).mkdir(parents=True, exist_ok=True)
+        lab.write_take(home / name / "run.mcap", 7)
+        if command:
+            (home / name / "configuration.json").write_text(f'{{"command": "{command}"}}')
+    assert [r.name for r in read_plan(source, home / "out")[1]] == wanted
+
+
+def test_imported_recordings_are_recordings_and_a_session_that_was_killed_is_none(source: Path, tmp_path: Path) -> None:
+    home, text = source / "phantom-00", "recordings:\n- {experiment: 'phantom-*', bags: ['**/*.mcap']}\n"
+    for name, command in (("phantom-00/monday", "import c3d"), ("phantom-02", "live")):
+        (source / name).mkdir()
+        lab.write_take(source / name / "a.mcap", 7)
+        (source / name / "configuration.json").write_text(f'{{"command": "{command}"}}')
+    (source / "phantom-02" / "experiment.yaml").write_text((home / "experiment.yaml").read_text())
+    takes = [f"phantom-0{i}/take-0{k}" for i in (0, 1) for k in (0, 1)]
+    assert [r.name for r in read_plan(source, tmp_path / "out")[1]] == ["phantom-00/a", *takes]
+    (source / "campaign.yaml").write_text(text)
+    found = {(r.name, r.experiment.name) for r in read_plan(source, tmp_path / "out")[1]}
+    assert {e for _, e in found} == {"phantom-00", "phantom-01"}
+    assert ("phantom-00/a", "phantom-00") in found
+
+
+def test_the_parts_of_a_bag_are_one_recording(source: Path, tmp_path: Path) -> None:
+    bag = source / "phantom-00" / "bags" / "long"
+    bag.mkdir(parents=True)
+    for part in (0, 1):
+        lab.write_take(bag / f"long_{part}.mcap", 7 + part)
+    (bag / "metadata.yaml").write_text("")
+    (source / "campaign.yaml").write_text("recordings:\n- {experiment: phantom-00, bags: ['bags/**/*']}\n")
+    assert [r.name for r in read_plan(source, tmp_path / "out")[1]] == ["phantom-00/long"]
+
+
 def test_a_file_names_recordings_rig_and_phantom(source: Path, tmp_path: Path) -> None:
     text = "version: 1\nrecordings:\n- {experiment: 'phantom-*', bags: ['take-00.mcap'], rig: two, phantom: gel}\n"
     (source / "campaign.yaml").write_text(text)

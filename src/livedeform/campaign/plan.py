@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import glob
 import itertools
+import json
 import os
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -23,6 +24,7 @@ from livedeform.outputs import CONFIGURATION
 CAMPAIGN_FILE = "campaign.yaml"
 BAG_FILES = (".mcap", ".db3")
 RESULT = "metrics.json"  # marks the folder of a run, whose experiment.yaml is a copy
+SOURCES = ("import", "synth")  # the commands whose folders hold recordings
 
 
 Whole = Annotated[int, BeforeValidator(not_bool)]
@@ -145,7 +147,7 @@ def _found(folder: Path, out: Path) -> Iterator[RecordingsOf]:
             continue
         known.add(here)
         folders[:] = sorted(f for f in folders if not f.startswith("."))
-        if FILE_NAME in files and RESULT not in files:
+        if FILE_NAME in files and not _is_result(here):
             yield RecordingsOf(experiment=str(Path(place).relative_to(folder)))
 
 
@@ -155,8 +157,8 @@ def _experiments(entry: RecordingsOf, folder: Path, out: Path) -> list[Path]:
     named = folder / entry.experiment
     if named.exists() or not _is_pattern(entry.experiment):
         return [named]
-    found = [path for path in _fitting(entry.experiment, folder) if not (_home(path) / RESULT).is_file()]
-    return [path for path in found if out not in (path.resolve(), *path.resolve().parents)]
+    found = [path for path in _fitting(entry.experiment, folder) if not _is_result(_home(path))]
+    return [path for path in found if not _is_below(path, out)]
 
 
 def _fitting(pattern: str, folder: Path) -> list[Path]:
@@ -174,7 +176,7 @@ def _recordings(entry: RecordingsOf, folder: Path, out: Path) -> Iterator[Campai
         own = _home(experiment)
         home = own.parent if own.name == "experiment" else own
         phantom = entry.phantom or _label(home, folder)
-        for bag in _bags(entry, folder, own, home):
+        for bag in _bags(entry, folder, own, home, out):
             name = f"{_label(home, folder)}/{bag.stem if bag.is_file() else bag.name}"
             yield CampaignRecording(name=name, experiment=experiment, bag=bag, phantom=phantom, rig=entry.rig)
 
@@ -198,19 +200,39 @@ def _refuse_odd_names(recordings: Iterable[CampaignRecording]) -> None:
                 raise InputError("its name is not UTF-8", where=shown, remedy="rename the file or folder")
 
 
-def _bags(entry: RecordingsOf, folder: Path, own: Path, home: Path) -> list[Path]:
-    """The bags that are named, or those that lie with the experiment: beside it, or in a folder ``bags``."""
+def _bags(entry: RecordingsOf, folder: Path, own: Path, home: Path, out: Path) -> list[Path]:
+    """The bags that are named, or those that lie with the experiment: beside it, or in a folder ``bags``. What a
+    pattern fits is a bag only where no command left it as its result."""
     if not entry.bags:
         places = list(dict.fromkeys([own, own / "bags", home / "bags"]))
         found = [path for place in places if place.is_dir() for path in place.iterdir() if is_bag(path)]
-        return sorted(path for path in found if path not in places and not _is_result(path))
-    out: list[Path] = []
+        return sorted(bag for path in found if path not in places and not _is_result(path) for bag in _bags_of(path))
+    bags: list[Path] = []
     for text in entry.bags:
         if _is_pattern(text) and not (own / text).exists() and not (folder / text).exists():
-            out += sorted({*_fitting(text, folder), *_fitting(text, own)})
+            fitting = {b for p in (*_fitting(text, folder), *_fitting(text, own)) if is_bag(p) for b in _bags_of(p)}
+            bags += sorted(path for path in fitting if not _is_left_behind(path, (own, folder), out))
         else:
-            out.append(own / text if (own / text).exists() else folder / text)
-    return out
+            bags.append(own / text if (own / text).exists() else folder / text)
+    return bags
+
+
+def _bags_of(path: Path) -> list[Path]:
+    """Return the rosbag2 folder that a file is a part of, those that a command wrote into a folder, or what it is."""
+    if path.is_file():
+        return [path.parent if (path.parent / "metadata.yaml").is_file() else path]
+    written = (path / CONFIGURATION).is_file() and not (path / "metadata.yaml").is_file()
+    return sorted(file for file in path.iterdir() if file.suffix in BAG_FILES) if written else [path]
+
+
+def _is_left_behind(bag: Path, places: tuple[Path, ...], out: Path) -> bool:
+    """Tell whether a command wrote the bag, or one of the folders in which it lies below one of the ``places``."""
+    around = itertools.takewhile(lambda folder: folder not in places, (bag, *bag.parents))
+    return _is_below(bag, out) or any(_is_result(folder) for folder in around if folder.is_dir())
+
+
+def _is_below(path: Path, out: Path) -> bool:
+    return out in (path.resolve(), *path.resolve().parents)
 
 
 def is_bag(path: Path) -> bool:
@@ -223,8 +245,16 @@ def is_bag(path: Path) -> bool:
 
 
 def _is_result(path: Path) -> bool:
-    """Tell whether a command wrote this folder: what is recorded in it is no recording of its own."""
-    return (path / RESULT).is_file() or (path / CONFIGURATION).is_file()
+    """Tell whether a command left this folder as its result: what is recorded in it is no recording of its own."""
+    if (path / RESULT).is_file():
+        return True
+    try:
+        command = str(json.loads((path / CONFIGURATION).read_text(encoding="utf-8"))["command"])
+    except (FileNotFoundError, NotADirectoryError):
+        return False
+    except (OSError, ValueError, KeyError, TypeError):
+        return True
+    return not command.startswith(SOURCES)
 
 
 def _is_pattern(text: str) -> bool:

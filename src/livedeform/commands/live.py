@@ -20,7 +20,8 @@ def live(
         NODES
     ),
     model: Annotated[
-        Path | None, typer.Option(help="A fitted experiment (experiment.fitted.yaml) in the experiment's place.")
+        Path | None,
+        typer.Option(help="A fitted experiment (experiment.fitted.yaml), whose body is used."),
     ] = None,
     expected: Annotated[
         Path | None,
@@ -57,7 +58,7 @@ def live(
         raise InputError("does not exist", where=str(expected), remedy="name a recording with the probe's poses")
     with Progress() as progress:
         metrics = run_live(
-            model or experiment, out, names, after=after or (), expected=expected, force=force, tell=progress
+            experiment, out, names, model=model, after=after or (), expected=expected, force=force, tell=progress
         )
     tell_metrics(metrics, out)
     judge(metrics, fail_over)

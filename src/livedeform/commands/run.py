@@ -11,9 +11,7 @@ from livedeform.commands.options import After, ExperimentArgument, Force, OutFol
 from livedeform.common.errors import InputError
 
 Rate = Annotated[str, typer.Option(help="Speed of the replay: 1.0 is real time; max plays in lock step, reproducibly.")]
-Model = Annotated[
-    Path | None, typer.Option(help="A fitted experiment (experiment.fitted.yaml) in the experiment's place.")
-]
+Model = Annotated[Path | None, typer.Option(help="A fitted experiment (experiment.fitted.yaml), whose body is used.")]
 Repeat = Annotated[
     list[Path] | None,
     typer.Option(

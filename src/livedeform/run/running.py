@@ -21,6 +21,7 @@ from livedeform.common.bags.recording import BEGINS, Recording, load_recording, 
 from livedeform.common.checks.finding import Finding, refuse_errors
 from livedeform.common.checks.recorded import check_recording
 from livedeform.common.errors import InputError
+from livedeform.common.experiment.fitted import in_setting_of
 from livedeform.common.experiment.markers_file import write_markers
 from livedeform.common.experiment.schema import Markers
 from livedeform.common.experiment.yaml_file import (
@@ -66,7 +67,7 @@ Tell = Callable[..., None]
 
 @dataclass(frozen=True)
 class RunOptions:
-    """``rate`` None plays in lock step; ``model`` is a fitted experiment that takes the experiment's place;
+    """``rate`` None plays in lock step; ``model`` is a fitted experiment, whose body takes the experiment's place;
     ``at_frames`` predicts at the measured frames' stamps, with the pose interpolated, instead of at every pose;
     ``after``: recordings that the body went through before, the earliest first; ``repeats``: runs of other takes of the
     same press with the same model."""
@@ -149,7 +150,9 @@ def run_into(options: RunOptions, tell: Tell) -> tuple[RunMetrics, Path]:
 
     That is another one than ``options.out`` where the run was interrupted and there are earlier results: they stay.
     """
-    experiment = model_of(options, tell)
+    with read_bag(options.bag) as bag:
+        name = own_name(options.bag, bag.metadata)
+    experiment = model_of(options.experiment, options.model, tell, name)
     if options.rate is not None and not options.rate > 0:
         raise InputError(f"a rate of {options.rate:g} is not positive", where="--rate", remedy="--rate 1.0, or max")
     inputs = [*files_of(experiment), options.bag, options.model, *options.after, *options.repeats]
@@ -180,22 +183,19 @@ def run_into(options: RunOptions, tell: Tell) -> tuple[RunMetrics, Path]:
     return metrics, options.out
 
 
-def model_of(options: RunOptions, tell: Tell) -> Experiment:
-    """The experiment, or the fitted model in its place, with what acts on the body in this recording.
-
-    Of a fitted model that is the body; loads, gravity and release are the experiment's, and it is said where those that
-    the model was fitted with are others.
-    """
-    with read_bag(options.bag) as bag:
-        name = own_name(options.bag, bag.metadata)
-    declared = load_experiment(options.experiment)
-    if options.model is None:
-        return declared.of_recording(name)
-    fitted, acting = load_experiment(options.model).of_recording(name), declared.of_recording(name).acting
-    if fitted.acting == acting:
-        return fitted
-    tell(f"warning: {options.model} is declared under {fitted.acting.text}; this recording is run under {acting.text}")
-    return fitted.under(acting)
+def model_of(experiment: Path, model: Path | None, tell: Tell, recording: str | None = None) -> Experiment:
+    """The experiment, or the fitted ``model`` in it, with what acts on the body in the ``recording`` of that name; None
+    of one that is made now. It is said where the two declare other things."""
+    declared = load_experiment(experiment)
+    if recording is not None:
+        declared = declared.of_recording(recording)
+    if model is None:
+        return declared
+    fitted = load_experiment(model)
+    together, differences = in_setting_of(fitted if recording is None else fitted.of_recording(recording), declared)
+    for difference in differences:
+        tell(f"warning: {model} {difference}")
+    return together
 
 
 def _checked(
@@ -432,6 +432,7 @@ def live(
     out: Path,
     names: Sequence[str],
     *,
+    model: Path | None = None,
     after: Sequence[Path] = (),
     expected: Path | None = None,
     force: bool,
@@ -439,14 +440,14 @@ def live(
 ) -> RunMetrics:
     """Runs the nodes called ``names`` on live topics and records until interrupted, then writes the results.
 
-    ``after``: as in `RunOptions`. ``expected``: a recording along whose poses the live model is prepared before the
-    session is ready.
+    ``model``, ``after``: as in `RunOptions`. ``expected``: a recording along whose poses the live model is prepared
+    before the session is ready.
     """
-    experiment = load_experiment(experiment_path)
+    experiment = model_of(experiment_path, model, tell)
     earlier_poses(after, time.time_ns(), experiment.timeline.release)
     options = {"experiment": experiment_path, "out": out, "nodes": list(names), "after": list(after)}
-    about = outputs.configuration("live", options | {"expected": expected})
-    inputs = [*files_of(experiment), *after, expected]
+    about = outputs.configuration("live", options | {"model": model, "expected": expected})
+    inputs = [*files_of(experiment), model, *after, expected]
     with outputs.prepared(out, WRITES, force=force, inputs=inputs, in_place=True) as draft:
         if draft != out:
             tell(f"the earlier results stay until this session ends; until then it is recorded in {draft}")
