@@ -17,19 +17,22 @@ pytest.importorskip("distributed")
 
 from livedeform.campaign import work as work_module
 from livedeform.campaign.campaign import CampaignOptions, alone_in, run_campaign
-from livedeform.campaign.jobs import Job
-from livedeform.campaign.plan import CampaignRecording
+from livedeform.campaign.jobs import Job, jobs_of
+from livedeform.campaign.plan import CampaignFile, CampaignRecording
 from livedeform.campaign.table import CSV, PARQUET, read_table
 from livedeform.campaign.work import outcome, work
 from livedeform.common.errors import InputError
 
 
-def job(tmp_path: Path) -> Job:
-    """A job that reads one recording."""
-    home = lab.write_phantom(tmp_path / "phantom")
+def job(tmp_path: Path, *, torn: bool = False) -> Job:
+    """A job that reads one recording, which may be torn."""
+    home, out = lab.write_phantom(tmp_path / "phantom"), tmp_path / "out"
     bag = lab.write_take(home / "take.mcap", 0)
+    if torn:
+        bag.write_bytes(bag.read_bytes()[:40])
     recording = CampaignRecording(name="phantom/take", experiment=home, bag=bag, phantom="phantom", rig="rig")
-    return Job(recording, tmp_path / "out" / "jobs" / "key", {"run": None, "diagnose": None})
+    out.mkdir(exist_ok=True)
+    return next(jobs_of([recording], CampaignFile(run=None, diagnose=None), out))
 
 
 def in_a_child(job: Job) -> int:
@@ -59,8 +62,7 @@ def test_a_job_leaves_its_row_and_is_not_done_again(tmp_path: Path) -> None:
 
 
 def test_a_broken_bag_is_named_with_its_line(tmp_path: Path) -> None:
-    mine = job(tmp_path)
-    mine.recording.bag.write_bytes(mine.recording.bag.read_bytes()[:40])
+    mine = job(tmp_path, torn=True)
     ended = outcome(mine, in_a_child(mine))
     assert not mine.is_done and "take.mcap" in ended.problem and not ended.passing
     assert mine.failure == ended.problem
@@ -77,6 +79,30 @@ def test_a_full_disk_is_passing_and_leaves_nothing_half_done(tmp_path: Path, mon
     ended = outcome(mine, in_a_child(mine))
     assert ended.passing and "the disk is full" in ended.problem
     assert not (mine.folder / "half").exists() and not mine.is_done
+
+
+@pytest.mark.parametrize("when", ["before it begins", "while it goes on"])
+def test_what_was_changed_meanwhile_is_not_kept_under_the_old_key(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, when: str
+) -> None:
+    """Taken back later, the change's result was the unchanged experiment's for good."""
+    mine = job(tmp_path)
+    file = mine.recording.experiment / "experiment.yaml"
+    steps = work_module._steps
+
+    def change() -> None:
+        file.write_text(file.read_text() + "\n# another\n")
+
+    def changing(job: Job) -> dict[str, object]:
+        change()
+        return steps(job)
+
+    if when == "before it begins":
+        change()
+    else:
+        monkeypatch.setattr(work_module, "_steps", changing)
+    ended = outcome(mine, in_a_child(mine))
+    assert not mine.is_done and ended.passing and "changed while the campaign went on" in ended.problem
 
 
 def test_a_killed_job_may_be_tried_again(tmp_path: Path) -> None:

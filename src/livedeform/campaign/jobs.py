@@ -20,6 +20,10 @@ FAILURE = "failure.json"
 CHUNK = 1 << 20
 
 
+class ChangedError(LivedeformError):
+    """The files of a job are no longer those that it was planned with."""
+
+
 @dataclass(frozen=True, eq=False)
 class Job:
     """One recording to go through, in a ``folder`` of its own that is named by its key.
@@ -93,14 +97,11 @@ def jobs_of(recordings: Sequence[CampaignRecording], settings: CampaignFile, out
         "run": None if settings.run is None else settings.run.model_dump(mode="json"),
         "diagnose": None if settings.diagnose is None else settings.diagnose.model_dump(mode="json"),
     }
-    made_with = {"versions": versions(), "options": options}
     for recording in recordings:
         try:
             if recording.experiment not in experiments:
                 experiments[recording.experiment] = _content(recording.experiment, digests)
-            of_experiment = experiments[recording.experiment]
-            parts = {**made_with, "experiment": of_experiment, "bag": _bag(recording.bag, digests)}
-            key = hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:24]
+            key = _key(experiments[recording.experiment], _bag(recording.bag, digests), options)
             yield Job(recording, out / "jobs" / key, options)
         except LivedeformError as error:
             yield Job(recording, out / "jobs", options, wrong=str(error))
@@ -108,6 +109,24 @@ def jobs_of(recordings: Sequence[CampaignRecording], settings: CampaignFile, out
             line = f"{error.filename or recording.bag}: cannot be read ({error.strerror})"
             yield Job(recording, out / "jobs", options, wrong=line)
     digests.save()
+
+
+def refuse_changed(job: Job) -> None:
+    """Raise ``ChangedError`` where the files of a job are others than when its key was made of them: what it found
+    would be kept under the key of what it was not made of."""
+    recording, digests = job.recording, Digests(job.folder.parents[1] / DIGESTS)
+    now = _key(_content(recording.experiment, digests), _bag(recording.bag, digests), job.options)
+    if now != job.key:
+        raise ChangedError(
+            "the experiment or the recording was changed while the campaign went on",
+            where=recording.name,
+            remedy="start the campaign again",
+        )
+
+
+def _key(experiment: list[list[str]], bag: list[list[str]], options: dict[str, Any]) -> str:
+    parts = {"versions": versions(), "options": options, "experiment": experiment, "bag": bag}
+    return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:24]
 
 
 def _content(path: Path, digests: Digests) -> list[list[str]]:

@@ -20,7 +20,7 @@ from multiprocessing import connection
 from pathlib import Path
 from typing import Any
 
-from livedeform.campaign.jobs import FAILURE, ROW, Job
+from livedeform.campaign.jobs import FAILURE, ROW, ChangedError, Job, refuse_changed
 from livedeform.campaign.row import row_of, write_row
 from livedeform.common.errors import LivedeformError
 from livedeform.outputs import UNWRITABLE, write_json
@@ -50,7 +50,9 @@ def work(job: Job) -> None:
         with _said_to(job.folder / LOG):
             start = time.perf_counter()
             try:
+                refuse_changed(job)
                 row = _steps(job)
+                refuse_changed(job)
                 _write_cost(job.folder, time.perf_counter() - start)
                 write_row(row, job.folder / ROW)
             except BaseException as error:
@@ -128,7 +130,7 @@ def _tell(text: str, fraction: float | None = None) -> None:
 
 def _write_failure(folder: Path, error: BaseException) -> None:
     cause = error if isinstance(error, OSError) else error.__cause__
-    passing = isinstance(cause, OSError) and cause.errno in UNWRITABLE
+    passing = isinstance(error, ChangedError) or (isinstance(cause, OSError) and cause.errno in UNWRITABLE)
     if isinstance(error, OSError) and passing:
         line = f"{folder}: cannot be written: {UNWRITABLE[error.errno or 0]}"
     elif isinstance(error, LivedeformError):
