@@ -279,6 +279,7 @@ def test_other_elements_or_markers_are_another_model(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("said", [
     {"recording": {"digest": "p", "whole": False}}, {"recording": None, "interrupted": True}, {"recording": None},
+    {"verdict": "STALE"},
 ])  # fmt: skip
 def test_a_part_of_a_recording_is_no_take(tmp_path: Path, said: dict) -> None:
     whole, part = written(tmp_path / "a", "a.mcap", 1e-3), written(tmp_path / "part", "p.mcap", 2e-3, **said)
@@ -298,3 +299,16 @@ def test_too_few_frames_for_an_interval_are_no_good_news(tmp_path: Path) -> None
     assert verdict_of(few, [unknown]).tone == "neutral"
     better = replace(difference, difference=Statistic(-1e-3, -2e-3, -1e-4))
     assert verdict_of(few, [better]).tone == "good"
+
+
+def test_what_either_had_no_answer_for_is_no_good_news(tmp_path: Path) -> None:
+    """A model that found no equilibrium in the presses, 4 mm off before, was better by its easy frames at rest."""
+    errors = np.vstack([noise(1, 2e-4, n=20), noise(2, 4e-3, n=80)])
+    declared, fitted = made("declared", errors), replace(made("fitted", 0.9 * errors[:20]), verdict="STALE")
+    verdict = verdict_of([declared, fitted], [compared(declared, fitted)])
+    assert verdict.tone == "warn"
+    assert "20 of the 100 frames that declared compared" in verdict.said and "fitted most was not" in verdict.said
+    whole = made("whole", 0.9 * errors)
+    assert verdict_of([declared, whole], [compared(declared, whole)]).tone == "good"
+    other = verdict_of([fitted, whole], [compared(fitted, whole)])
+    assert other.tone == "warn" and "20 of the 100 frames that whole compared" in other.said

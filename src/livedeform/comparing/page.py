@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from livedeform.compare_node.judgement import decimals
-from livedeform.compare_node.metrics import Statistic, rmse
+from livedeform.compare_node.metrics import Level, Statistic, rmse
 from livedeform.compare_node.takes import Takes
 from livedeform.comparing.runs import ComparedRun, Difference, MarkerDifference
 from livedeform.comparing.takes import groups, sharing
@@ -25,6 +25,8 @@ HEADER = ("run", "recording", "verdict", "errors", "frames", "rmse (mm)", "95 % 
 AGAINST = ("run", "common errors", "common frames", "rmse of the first (mm)", "its own rmse (mm)", "difference (mm)",
            "95 % interval (mm)")  # fmt: skip
 
+STALE = str(Level.STALE)
+FEW_COMMON = 0.9  # of a run's frames: a difference of fewer is one of a part
 LEAST_PERCENT = 0.01  # below, a difference is said to be less than that
 TAKES = ("takes", "n", "mean rmse (mm)", "mean of takes, 95 % (mm)", "next take, 95 % (mm)")
 
@@ -136,7 +138,8 @@ def _share(share: float) -> str:
 
 
 def verdict_of(runs: Sequence[ComparedRun], differences: Sequence[Difference | None]) -> Verdict:
-    """Say what the differences come to: good where a run is told to be better than the first, and none to be worse."""
+    """Say what the differences come to: good where a run is told to be better than the first, and none to be worse, nor
+    left out where either had no answer."""
     said = [sentence(d, runs[0].name) for d in differences if d is not None]
     if not said:
         return Verdict(
@@ -146,9 +149,22 @@ def verdict_of(runs: Sequence[ComparedRun], differences: Sequence[Difference | N
         )
     intervals = [d.difference for d in differences if d is not None and np.isfinite(d.difference.low)]
     better, worse = any(i.high < 0.0 for i in intervals), any(i.low > 0.0 for i in intervals)
-    tone = "warn" if worse else "good" if better else "neutral"
-    because = "; ".join(said)
+    doubts = doubts_of(runs, differences)
+    tone = "warn" if worse or doubts else "good" if better else "neutral"
+    because = "; ".join([*said, *doubts])
     return Verdict(tone, because[:1].upper() + because[1:] + ".", "Paired by stamp and marker.")
+
+
+def doubts_of(runs: Sequence[ComparedRun], differences: Sequence[Difference | None]) -> list[str]:
+    """Say of which runs most was not compared, and where a difference is of a part of what either compared: what one
+    model has no answer for may be what it is worst at."""
+    said = [f"of {run.name} most was not compared (STALE)" for run in runs if run.verdict == STALE]
+    for run, d in zip(runs[1:], differences, strict=True):
+        for one in (runs[0], run) if d is not None else ():
+            if d is not None and d.n_frames < FEW_COMMON * one.metrics.n_frames:
+                both = f"{d.n_frames} of the {one.metrics.n_frames} frames that {one.name} compared"
+                said.append(f"{d.name} and {runs[0].name} are told apart by {both}")
+    return said
 
 
 def _curves(runs: Sequence[ComparedRun]) -> Chart:

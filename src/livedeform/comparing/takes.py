@@ -17,7 +17,8 @@ from livedeform.common.bags.read import read_bag
 from livedeform.common.errors import InputError, RecordingError
 from livedeform.common.experiment.markers_file import read_markers
 from livedeform.common.experiment.yaml_file import FILE_NAME
-from livedeform.compare_node.metrics import RunMetrics
+from livedeform.compare_node.judgement import judge
+from livedeform.compare_node.metrics import Level, RunMetrics
 from livedeform.compare_node.takes import NUMBERS, Takes, expected, expected_of_markers
 from livedeform.comparing.identity import LETTERS, digest_of
 from livedeform.outputs import CONFIGURATION, RECORDING
@@ -30,7 +31,7 @@ ELSE = ("name", "effects", "loads", "probe")
 class Take:
     """One run's ``numbers`` (rmse, mean, p95; m) and its ``markers``' rms errors (m) by id, of a recording that
     ``source`` tells from others; ``model`` says what was predicted with, and ``mesh`` on which elements: alike for
-    alike models. Not ``whole``: a part of the recording was run, or the run was interrupted."""
+    alike models. Not ``whole``: a part of the recording was run, the run was interrupted, or most was not compared."""
 
     name: str
     source: str
@@ -58,10 +59,11 @@ def read_take(path: Path, name: str = "") -> Take:
     if not all(isinstance(v, float) and v > 0.0 for v in numbers.values()):
         raise InputError("compared nothing with a model", where=str(path), remedy="name a run that did")
     part = bool(options.get("start") or options.get("duration"))
-    whole = (document.get("recording") or {}).get("whole", not part) and not document.get("interrupted", False)
+    ran = (document.get("recording") or {}).get("whole", not part) and not document.get("interrupted", False)
     return Take(
-        name or Path(bag).stem, _source(folder, document, options, whole=whole), model, numbers, markers,
-        mesh=str((document.get("mesh") or {}).get("digest", "")), whole=whole, path=path,
+        name or Path(bag).stem, _source(folder, document, options, whole=ran), model, numbers, markers,
+        mesh=str((document.get("mesh") or {}).get("digest", "")),
+        whole=ran and document.get("verdict") != str(Level.STALE), path=path,
     )  # fmt: skip
 
 
@@ -88,7 +90,7 @@ def read_repeats(paths: Sequence[Path], bag: Path, digest: str, model: str) -> l
             raise _another_model(path)
         if not take.whole:
             remedy = "name runs of whole recordings"
-            raise InputError("ran only a part of its recording", where=f"--repeat {path}", remedy=remedy)
+            raise InputError("ran or compared only a part of its recording", where=f"--repeat {path}", remedy=remedy)
         if take.source in known:
             remedy = "name runs of other takes of the same press"
             raise InputError(f"is of a recording that counts already ({bag.name})", where=f"--repeat {path}",
@@ -135,8 +137,10 @@ def _markers_digest(path: Path) -> str:
 
 def with_repeats(metrics: RunMetrics, name: str, repeats: Sequence[Take]) -> Takes | None:
     """Put this run of the recording ``name`` and those of other takes together; None where there are none, or where
-    this run was interrupted."""
-    if not repeats or not metrics.n or (metrics.coverage is not None and metrics.coverage.interrupted):
+    this run was interrupted, or most of it was not compared."""
+    if not repeats or not metrics.n or judge(metrics).level is Level.STALE:
+        return None
+    if metrics.coverage is not None and metrics.coverage.interrupted:
         return None
     numbers = {"rmse": metrics.rmse.value, "mean": metrics.mean.value, "p95": metrics.p95.value}
     return together([Take(name, "", "", numbers, {m.id: m.rmse for m in metrics.markers}), *repeats])
