@@ -39,4 +39,5 @@ def _sentence(info: EffectInfo, cards: Sequence[EffectInfo]) -> str:
         return f"how often 95 % intervals of {info.name} hold has not been measured"
     family = family_of(info)
     held, n = (sum(card.proved[i] for card in cards if family_of(card) == family) for i in (0, 1))
-    return f"95 % intervals of this family ({family}) held in {round(100 * held / n)} % of {n} blind values"
+    share = f"{round(100 * held / n)} % of {n} blind values"
+    return f"95 % intervals of this family ({family}) held in {share}, given the effect"

@@ -46,7 +46,7 @@ INFO = EffectInfo(
     possible=is_bonded,
     tangent=False,
     switched=True,
-    proved=(4, 4),
+    proved=(5, 5),
 )
 
 

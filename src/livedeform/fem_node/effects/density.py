@@ -33,7 +33,7 @@ INFO = EffectInfo(
     shown_by="weighing; a wrench",
     confused_with=("stiffness",),
     possible=weighs,
-    proved=(4, 4),
+    proved=(5, 5),
 )
 
 

@@ -33,7 +33,7 @@ INFO = EffectInfo(
     confused_with=("base_slip",),
     possible=weighs,
     told_apart_by={"base_slip": "turn the phantom by 180 degrees on its table and record it at rest"},
-    proved=(8, 8),
+    proved=(6, 6),
 )
 
 

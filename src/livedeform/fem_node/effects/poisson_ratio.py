@@ -30,7 +30,7 @@ INFO = EffectInfo(
     ),
     shown_by="sideways bulging under several presses",
     confused_with=("density", "stereo_scale", "scan_gravity"),
-    proved=(3, 4),
+    proved=(15, 16),
 )
 
 

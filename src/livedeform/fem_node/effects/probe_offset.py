@@ -33,7 +33,7 @@ INFO = EffectInfo(
     shown_by="frames of first touch, several angles",
     confused_with=("scan_gravity", "skin"),
     like_mesh=True,
-    proved=(24, 24),
+    proved=(12, 12),
 )
 
 

@@ -36,7 +36,7 @@ INFO = EffectInfo(
     starts=_starts,
     told_apart_by={"stiffness_gradient": "press with a smaller probe, or turn the phantom over"},
     together=Together("thickness x (ratio - 1)", "m", _membrane),
-    proved=(48, 48),
+    proved=(24, 24),
 )
 
 

@@ -35,7 +35,7 @@ INFO = EffectInfo(
     told_apart_by={
         "density": "weigh the phantom, or record the probe's force: displacements alone give only density / stiffness"
     },
-    proved=(4, 4),
+    proved=(5, 5),
 )
 
 

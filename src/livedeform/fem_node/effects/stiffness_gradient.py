@@ -19,7 +19,7 @@ INFO = EffectInfo(
     parameters=(Parameter("slope", "1/m", start=0.0, lower=-40.0, upper=40.0, sigma=10.0, neutral=0.0, step=0.5),),
     shown_by="turning the phantom over; presses at different heights",
     confused_with=("skin", "strain_stiffening"),
-    proved=(4, 4),
+    proved=(6, 6),
 )
 
 

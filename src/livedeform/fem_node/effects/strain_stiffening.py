@@ -27,7 +27,7 @@ INFO = EffectInfo(
     shown_by="two press depths",
     confused_with=("stiffness_gradient", "skin"),
     possible=_extends,
-    proved=(3, 4),
+    proved=(5, 6),
 )
 
 

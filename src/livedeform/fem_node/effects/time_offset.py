@@ -21,7 +21,7 @@ INFO = EffectInfo(
     ),
     shown_by="reversals, two speeds",
     confused_with=("viscoelasticity", "probe_adhesion"),
-    proved=(3, 4),
+    proved=(4, 5),
 )
 
 

@@ -50,7 +50,7 @@ INFO = EffectInfo(
     possible=is_filmed,
     starts=_starts,
     order=4,
-    proved=(42, 42),
+    proved=(21, 21),
     once=True,
 )
 

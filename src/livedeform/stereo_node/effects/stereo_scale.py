@@ -23,7 +23,7 @@ INFO = EffectInfo(
     told_apart_by={"swelling": "measure a second known length (a caliper between two markers on the support)"},
     possible=is_filmed,
     order=1,
-    proved=(4, 4),
+    proved=(5, 5),
 )
 
 
