@@ -103,9 +103,9 @@ def test_a_value_has_the_digits_that_its_sigma_tells(
 @pytest.mark.parametrize(
     ("after", "interval", "said"),
     [
-        (0.0002, [0.79, 0.83], "(82 % less; 95 % interval, these recordings: 79 to 83 % less)"),
-        (0.00132, [-0.3, -0.1], "(20 % more; 95 % interval, these recordings: 30 to 10 % more)"),
-        (0.0002, [None, None], "(82 % less; these recordings do not tell between which ends)"),
+        (0.0002, [0.79, 0.83], "(82 % less; 95 % interval over presses like these: 79 to 83 % less)"),
+        (0.00132, [-0.3, -0.1], "(20 % more; 95 % interval over presses like these: 30 to 10 % more)"),
+        (0.0002, [None, None], "(82 % less; one press does not tell between which ends)"),
     ],
 )
 def test_the_change_of_the_error_has_one_sign_and_no_nan(

@@ -353,7 +353,7 @@ def _diagnosis(
         ranking=ranked,
         errors_before=before,
         errors_after=after,
-        improvement=improvement_interval(before, after, seed=seed),
+        improvement=improvement_interval(before, after),
         explained=conclusion.explained,
         discrepancy=left,
         text=" ".join(filter(None, [conclusion.sentence, where, stated.in_place])),

@@ -205,10 +205,8 @@ def _rises(differences: Sequence[Difference | None]) -> Chart | None:
         value = np.array([m.difference.value for m in d.markers]) * MM
         low = value - np.array([m.difference.low for m in d.markers]) * MM
         high = np.array([m.difference.high for m in d.markers]) * MM - value
-        bars = {"type": "data", "symmetric": False, "array": np.nan_to_num(high), "arrayminus": np.nan_to_num(low),
-                "thickness": 1.2, "width": 2, "color": plots.GREY}  # fmt: skip
         figure.add_bar(
-            x=[str(m.id) for m in d.markers], y=value, name=d.name, error_y=bars,
+            x=[str(m.id) for m in d.markers], y=value, name=d.name, error_y=plots.whiskers(high, low),
             marker_color=COLOURS[(i + 1) % len(COLOURS)], hovertemplate="marker %{x}: %{y:+.3f} mm",
         )  # fmt: skip
     layout = plots.base_layout(height=340)

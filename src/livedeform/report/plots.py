@@ -132,8 +132,8 @@ def _merged(marks: Mapping[str, float], apart: float) -> list[tuple[str, float]]
 
 @dataclass(frozen=True)
 class Bars:
-    """One bar per marker: ``ids`` (m,), ``rms`` error (m,) m, ``half`` (m,) m the half width of its 95 % interval, and
-    ``weights`` (m,), what each counts in a mean over the markers."""
+    """One bar per marker: ``ids`` (m,), ``rms`` error (m,) m, ``half`` (m,) m the half width of its 95 % interval,
+    NaN where it is not known, and ``weights`` (m,), what each counts in a mean over the markers."""
 
     ids: Ids
     rms: Array
@@ -141,15 +141,26 @@ class Bars:
     weights: Array
 
 
+def whiskers(high: Array, low: Array | None = None) -> dict[str, Any] | None:
+    """Draw intervals from ``low`` below to ``high`` above (n,), as far as they are known: one of no length would look
+    the surest of all. None where none is known."""
+    if not np.isfinite(high).any():
+        return None
+    said = {"type": "data", "array": _known(high), "thickness": 1.2, "width": 2, "color": GREY}
+    return said if low is None else said | {"symmetric": False, "arrayminus": _known(low)}
+
+
+def _known(values: Array) -> list[float | None]:
+    return [float(v) if np.isfinite(v) else None for v in values]
+
+
 def error_per_marker(groups: Mapping[str, Bars], colours: Sequence[str] = (BLUE, ORANGE)) -> go.Figure:
     """Bars (mm) with intervals for each of the named groups."""
     figure = go.Figure()
     for (name, bars), colour in zip(groups.items(), colours, strict=False):
-        half = bars.half
         figure.add_bar(
             x=[str(i) for i in bars.ids], y=bars.rms * MM, name=name, marker_color=colour, customdata=bars.weights,
-            error_y={"type": "data", "array": np.nan_to_num(half) * MM, "thickness": 1.2, "width": 2, "color": GREY},
-            hovertemplate="marker %{x}: %{y:.3f} mm",
+            error_y=whiskers(bars.half * MM), hovertemplate="marker %{x}: %{y:.3f} mm",
         )  # fmt: skip
     layout = base_layout(height=340)
     layout["xaxis"] = {"title": "marker id", "type": "category"}

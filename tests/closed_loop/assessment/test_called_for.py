@@ -98,7 +98,20 @@ def errors(predicted: Array, sigma: Array) -> HeldOutErrors:
     covariances = np.broadcast_to(np.diag(sigma**2), (k, m, 3, 3))
     weights = np.linspace(1.0, 2.0, k)
     return HeldOutErrors(
-        (RecordingErrors("b", 0, np.arange(k), np.arange(m), measured, predicted, covariances, weights, np.arange(k)),)
+        (
+            RecordingErrors(
+                "b",
+                0,
+                np.arange(k),
+                np.arange(m),
+                measured,
+                predicted,
+                covariances,
+                weights,
+                np.arange(k),
+                np.arange(k) + 1,
+            ),
+        )
     )
 
 

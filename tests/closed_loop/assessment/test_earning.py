@@ -78,7 +78,16 @@ def errors(
     k, m, _ = measured.shape
     covariances = np.broadcast_to(np.eye(3) * sigma**2, (k, m, 3, 3))
     one = RecordingErrors(
-        "b", 0, np.arange(k), np.arange(m), measured, predicted, covariances, np.linspace(1.0, 2.0, k), blocks
+        "b",
+        0,
+        np.arange(k),
+        np.arange(m),
+        measured,
+        predicted,
+        covariances,
+        np.linspace(1.0, 2.0, k),
+        blocks,
+        blocks + 1,
     )
     return HeldOutErrors((one,))
 

@@ -43,12 +43,11 @@ def _line(name: str, recording: Compared, residuals: Sequence[Residual], colour:
 
 @dataclass(frozen=True)
 class _MarkerErrors:
-    """The errors of each marker over all moments, each weighted with its time: ``ids`` (m,), ``rms`` (m,) m, ``half``
-    (m,) m of its 95 % interval, ``mean`` (m, 3) m and ``seconds`` (m,) that they stand for."""
+    """The errors of each marker over all moments, each weighted with its time: ``ids`` (m,), ``rms`` (m,) m, ``mean``
+    (m, 3) m and ``seconds`` (m,) that they stand for."""
 
     ids: Ids
     rms: Array
-    half: Array
     mean: Array
     seconds: Array
 
@@ -62,12 +61,10 @@ def _marker_errors(recordings: Sequence[Compared], after: bool) -> _MarkerErrors
         return np.asarray(np.bincount(row, values), float)
 
     seconds = per_marker(weights)
-    share, squares = weights / seconds[row], table.distances**2
-    square = per_marker(share * squares)
-    spread = np.sqrt(per_marker(share**2 * (squares - square[row]) ** 2))
-    half = np.divide(1.96 * spread, 2.0 * np.sqrt(square), out=np.zeros_like(square), where=square > 0.0)
+    share = weights / seconds[row]
+    square = per_marker(share * table.distances**2)
     mean = np.stack([per_marker(share * e) for e in table.errors.T], axis=1)
-    return _MarkerErrors(ids, np.sqrt(square), half, mean, seconds)
+    return _MarkerErrors(ids, np.sqrt(square), mean, seconds)
 
 
 def per_marker_chart(recordings: Sequence[Compared]) -> Chart | None:
@@ -76,11 +73,9 @@ def per_marker_chart(recordings: Sequence[Compared]) -> Chart | None:
     groups = {}
     for name, after in (("before", False), ("after", True)):
         e = _marker_errors(recordings, after)
-        groups[name] = plots.Bars(e.ids, e.rms, e.half, e.seconds)
+        groups[name] = plots.Bars(e.ids, e.rms, np.full(len(e.ids), np.nan), e.seconds)
     figure = plots.error_per_marker(groups, (plots.ORANGE, plots.BLUE))
-    return Chart(
-        "per-marker", figure, "Root mean square error of each marker on the held-out recordings, with 95 % intervals."
-    )
+    return Chart("per-marker", figure, "Root mean square error of each marker on the held-out recordings.")
 
 
 def on_surface_chart(recordings: Sequence[Compared], body: RestingBody | None) -> Chart | None:

@@ -110,8 +110,8 @@ def _gain(diagnosis: Mapping[str, Any]) -> str:
     change = less(1.0 - after / before)
     low, high = diagnosis.get("improvement_interval") or (float("nan"), float("nan"))
     if not np.isfinite([low, high]).all():
-        return f" ({change}; these recordings do not tell between which ends)"
-    return f" ({change}; 95 % interval, these recordings: {less_between(low, high)})"
+        return f" ({change}; one press does not tell between which ends)"
+    return f" ({change}; 95 % interval over presses like these: {less_between(low, high)})"
 
 
 def next_recording(diagnosis: Mapping[str, Any]) -> str:
