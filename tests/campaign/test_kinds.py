@@ -60,7 +60,7 @@ def test_inclusions_at_one_place_are_one_and_at_others_are_not(tmp_path: Path) -
     assert shared(near) == [("inclusion", 4)]
     at = {place["name"]: place["value"] for place in near.shared[0]["at"]}
     assert at == pytest.approx({"centre[0]": 0.02, "radius": 0.01})
-    assert near.shared[0]["said"][1:] == ["at centre[0] 0.02", "at radius 0.01"]
+    assert near.shared[0]["said"][1:] == ["at centre[0] 0.02 m", "at radius 0.01 m"]
     apart = pool_jobs(laboratory(tmp_path / "apart", [0.0, 0.03, 0.06, -0.03]), tmp_path)
     assert shared(apart) == []
     own = json.loads((tmp_path / "shared.json").read_text())["own"]

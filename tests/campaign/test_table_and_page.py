@@ -46,7 +46,7 @@ DIAGNOSIS = {
 def test_a_row_says_what_was_measured_and_found() -> None:
     row = row_of(METRICS, DIAGNOSIS, (5, 2_000_000_005))
     assert (row["coverage"], row["duration_s"], row["error_after_m"]) == (0.9, 2.0, 2e-4)
-    assert row["effects"] == "viscoelasticity: g 0.3 [0.28, 0.32], tau 2"
+    assert row["effects"] == "viscoelasticity: g 0.3 [0.28, 0.32], tau 2 s"
     assert row["rivals"] == "softening"
     assert effect_words({"name": "density", "parameters": {"ratio": {"value": 1.1}}}) == "density: ratio 1.1"
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,7 @@ from livedeform.campaign.evidence import (
     read_evidence,
 )
 from livedeform.campaign.jobs import Job
-from livedeform.campaign.row import INTERVAL, interval_words
+from livedeform.campaign.row import INTERVAL, interval_words, unit_words
 from livedeform.campaign.shared_causes import Pooled, Scope, Shared, pool
 from livedeform.closed_loop.candidates import all_effects
 from livedeform.common.types import Array
@@ -94,18 +95,19 @@ def _each(evidence: Sequence[KeptEvidence], label: str) -> list[str]:
 
 def document(s: Shared, evidence: Sequence[KeptEvidence]) -> dict[str, Any]:
     """A shared cause as it is written: values with 95 % intervals of the common value, the scatter between takes in
-    them, and how far single takes are from it; and all of that in words."""
+    them, and of another take's; and all of that in words."""
     labels = next(e.labels[s.effect] for e in evidence if e.name in s.scope and s.effect in e.labels)
     sigma = np.sqrt(s.unsure)
     parameters: list[dict[str, Any]] = [
         {
             "name": _name(label),
             "value": label.value(float(s.value[k])),
-            "interval_95": _ends(label, s.value[k], sigma[k]),
-            "takes_95": _ends(label, s.value[k], s.scatter[k]),
+            "interval_95": _ends(label, s.value[k], INTERVAL * sigma[k]),
+            "takes_95": _ends(label, s.value[k], s.ahead[k]),
         }
         for k, label in enumerate(labels)
     ]
+    unit = partial(_unit, effect_of(s.effect))
     at = _usual_shape([e.shapes.get(s.effect, ()) for e in evidence if e.name in s.members])
     return {
         "effect": effect_of(s.effect),
@@ -117,10 +119,10 @@ def document(s: Shared, evidence: Sequence[KeptEvidence]) -> dict[str, Any]:
         "at": at,
         "log_evidence": s.gain,
         "said": [
-            *(f"{p['name']} {interval_words(p['value'], *p['interval_95'])}" for p in parameters),
-            *(f"at {p['name']} {p['value']:.3g}" for p in at),
+            *(f"{p['name']} {interval_words(p['value'], *p['interval_95'])}{unit(p)}" for p in parameters),
+            *(f"at {p['name']} {p['value']:.3g}{unit(p)}" for p in at),
         ],
-        "scatter_said": [interval_words(p["value"], *p["takes_95"]).partition(" ")[2] for p in parameters],
+        "scatter_said": [interval_words(p["value"], *p["takes_95"]).partition(" ")[2] + unit(p) for p in parameters],
     }
 
 
@@ -130,15 +132,20 @@ def _usual_shape(shapes: Sequence[Sequence[KeptShape]]) -> list[dict[str, Any]]:
     return [{"name": _name(shape), "value": value} for shape, value in middle]
 
 
+def _unit(effect: str, parameter: Mapping[str, Any]) -> str:
+    """Return the unit of a parameter of an effect as it stands behind its value."""
+    return unit_words(effect, str(parameter["name"]).partition("[")[0])
+
+
 def _name(label: Label | KeptShape) -> str:
     if not label.parameter:  # an effect that is switched as a whole: how much of it there is
         return "amount"
     return label.parameter if label.index < 0 else f"{label.parameter}[{label.index}]"
 
 
-def _ends(label: Label, x: float, sigma: float) -> list[float]:
-    """Return the ends of a 95 % interval in the parameter's unit, the lower first."""
-    return sorted(label.value(float(x + side * INTERVAL * sigma)) for side in (-1.0, 1.0))
+def _ends(label: Label, x: float, half: float) -> list[float]:
+    """Return the ends of an interval of ``half`` a width on either side in the parameter's unit, the lower first."""
+    return sorted(label.value(float(x + side * half)) for side in (-1.0, 1.0))
 
 
 def _own(found: Pooled, evidence: Sequence[KeptEvidence]) -> Mapping[str, list[dict[str, Any]]]:
@@ -164,7 +171,7 @@ def _told(effect: str, labels: Sequence[Label], values: Array, variances: Array)
     return {
         "effect": effect_of(effect),
         "parameters": [
-            {"name": _name(label), "value": label.value(float(x)), "interval_95": _ends(label, x, float(np.sqrt(v)))}
-            for label, x, v in zip(labels, values, variances, strict=True)
+            {"name": _name(label), "value": label.value(float(x)), "interval_95": _ends(label, x, INTERVAL * sigma)}
+            for label, x, sigma in zip(labels, values, np.sqrt(variances), strict=True)
         ],
     }

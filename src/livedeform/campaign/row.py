@@ -13,6 +13,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from livedeform.closed_loop.assessment.verdict import rivals_of
+from livedeform.closed_loop.candidates import all_effects
 from livedeform.common.effect import significant
 from livedeform.common.types import Array
 
@@ -119,8 +120,16 @@ def effect_words(effect: Mapping[str, Any]) -> str:
         ends = _ends(parameter, values)
         before = " ".join(f"{v:.3g}" for v in np.ravel(parameter["declared"])) if "declared" in parameter else ""
         told = " ".join(interval_words(v, *e) for v, e in zip(values, ends, strict=True))
+        told += unit_words(effect["name"], name)
         said.append(f"{name} {told}" + (f" (declared {before})" if before else ""))
     return f"{effect['name']}: {', '.join(said)}"
+
+
+def unit_words(effect: str, parameter: str) -> str:
+    """Return the unit of an effect's parameter as it stands behind its value; empty where it has none."""
+    units = {p.name: p.unit for p in all_effects()[effect].parameters} if effect in all_effects() else {}
+    unit = units.get(parameter, "")
+    return "" if unit in ("", "-", "1") else f" {unit}"
 
 
 def _ends(parameter: Mapping[str, Any], values: Array) -> Array:

@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 from math import lgamma, log
 
 import numpy as np
+from scipy.special import ndtr
 
 from livedeform.campaign.evidence import KeptEvidence
 from livedeform.common.types import Array
@@ -51,7 +52,8 @@ class Scope:
 class Shared:
     """A shared cause: an ``effect`` of the recordings in ``scope`` (their names), at ``value`` (d,) with variance
     ``variance`` (d,) and ``scatter`` (d,) between takes, all in sigmas; ``unsure`` (d,): that variance whatever the
-    scatter, which few takes hardly tell; ``share`` of them that are ``members``; ``gain`` in log evidence."""
+    scatter, which few takes hardly tell, and ``ahead`` (d,): how far another take lies with 95 %; ``share`` of them
+    that are ``members``; ``gain`` in log evidence."""
 
     where: str
     effect: str
@@ -60,6 +62,7 @@ class Shared:
     variance: Array
     scatter: Array
     unsure: Array
+    ahead: Array
     share: float
     members: tuple[str, ...] = ()
     gain: float = 0.0
@@ -269,9 +272,8 @@ def _proposed(
         total = gains[gains > 0.0].sum() - _choosing(n, m)
         if m >= settings.least and (best is None or total > best.gain):
             share = float(np.clip((m + 1.0) / (n + 2.0), 0.02, 0.98))
-            best = Shared(
-                where, effect, frozenset(bases), value, variance / m, scatter, variance / m, share, gain=float(total)
-            )
+            mean, found = variance / m, float(total)
+            best = Shared(where, effect, frozenset(bases), value, mean, scatter, mean, 2.0 * scatter, share, gain=found)
     return best if best is not None and best.gain > 0.0 else None
 
 
@@ -316,8 +318,9 @@ def _refined(
     told = [_told_beside(e, found[e.name], number, shared) for e in members]
     values, variances = (np.array([t[i] for t in told]) for i in (0, 1))
     value, variance, scatter = random_effects(values, variances, settings.scatter)
-    unsure = variance_of_mean(values, variances, value, settings.scatter)
-    return replace(s, value=value, variance=variance, scatter=scatter, unsure=unsure, share=share)
+    all_scatters = Scatters.of(values, variances, value, settings.scatter)
+    unsure, ahead = all_scatters.variance_about(value), all_scatters.next_within(value)
+    return replace(s, value=value, variance=variance, scatter=scatter, unsure=unsure, ahead=ahead, share=share)
 
 
 def _told_beside(e: KeptEvidence, x: Causes, number: int, shared: Sequence[Shared]) -> tuple[Array, Array]:
@@ -345,20 +348,45 @@ def random_effects(values: Array, variances: Array, least: float) -> tuple[Array
     return (w * values).sum(axis=0) / total, 1.0 / total, np.sqrt(scatter2)
 
 
-def variance_of_mean(values: Array, variances: Array, value: Array, least: float) -> Array:
-    """Return the variance (d,) of the common ``value`` (d,) of `random_effects` over all scatters between takes.
+@dataclass(frozen=True)
+class Scatters:
+    """All scatters between takes that values allow, ``tau2`` (g, d) variances with probability ``p`` (g, d), and by
+    each the common value ``mean`` (g, d) and its ``variance`` (g, d).
 
-    Each counts by its likelihood under the values (m, d), times a half-Cauchy prior (Gelman 2006) that is as wide as a
-    single take's sigma and the share ``least`` of the value together.
+    Each counts by its likelihood, times a half-Cauchy prior (Gelman 2006) that is as wide as a single take's sigma and
+    the share ``least`` of the value together.
     """
-    floor = least * np.abs(value)
-    wide = np.sqrt(np.median(variances, axis=0)) + floor
-    steps = np.linspace(0.0, 1.0, GRID) ** 2 * FAR
-    tau2 = floor**2 + (steps[:, None] * wide) ** 2
-    w = 1.0 / (variances + tau2[:, None])
-    total = w.sum(axis=1)
-    mean = (w * values).sum(axis=1) / total
-    likelihood = np.log(w).sum(axis=1) - np.log(total) - (w * (values - mean[:, None]) ** 2).sum(axis=1)
-    log_p = 0.5 * likelihood - np.log1p(steps**2)[:, None]
-    p = np.exp(log_p - log_p.max(axis=0)) * np.gradient(steps)[:, None]
-    return np.asarray((p / p.sum(axis=0) * (1.0 / total + (mean - value) ** 2)).sum(axis=0))
+
+    tau2: Array
+    p: Array
+    mean: Array
+    variance: Array
+
+    @classmethod
+    def of(cls, values: Array, variances: Array, value: Array, least: float) -> Scatters:
+        """Weigh them by ``values`` (m, d) with variances; ``value`` (d,) is that of `random_effects`."""
+        floor = least * np.abs(value)
+        wide = np.sqrt(np.median(variances, axis=0)) + floor
+        steps = np.linspace(0.0, 1.0, GRID) ** 2 * FAR
+        tau2 = floor**2 + (steps[:, None] * wide) ** 2
+        w = 1.0 / (variances + tau2[:, None])
+        total = w.sum(axis=1)
+        mean = (w * values).sum(axis=1) / total
+        likelihood = np.log(w).sum(axis=1) - np.log(total) - (w * (values - mean[:, None]) ** 2).sum(axis=1)
+        log_p = 0.5 * likelihood - np.log1p(steps**2)[:, None]
+        p = np.exp(log_p - log_p.max(axis=0)) * np.gradient(steps)[:, None]
+        return cls(tau2, p / p.sum(axis=0), mean, 1.0 / total)
+
+    def variance_about(self, value: Array) -> Array:
+        """Return the variance (d,) of the common value about ``value`` (d,), whatever the scatter."""
+        return np.asarray((self.p * (self.variance + (self.mean - value) ** 2)).sum(axis=0))
+
+    def next_within(self, value: Array) -> Array:
+        """Return how far (d,) about ``value`` (d,) another take lies with 95 %, whatever the scatter."""
+        sigma, off = np.sqrt(self.tau2 + self.variance), self.mean - value
+        low, high = np.zeros(len(value)), np.max(np.abs(off) + 5.0 * sigma, axis=0)
+        for _ in range(60):
+            half = 0.5 * (low + high)
+            inside = (self.p * (ndtr((half - off) / sigma) - ndtr((-half - off) / sigma))).sum(axis=0)
+            low, high = np.where(inside < 0.95, half, low), np.where(inside < 0.95, high, half)
+        return np.asarray(high)

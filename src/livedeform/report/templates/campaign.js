@@ -7,7 +7,7 @@
   const TONE = { status: { done: "neutral", failed: "bad" }, run_verdict: { OK: "good", ERROR: "bad", STALE: "bad" }, verdict: { none: "good", unexplained: "bad" } };
   const REPORTS = { run_verdict: [1, "run"], verdict: [2, "diagnosis"] };  // bit of the row's links, and the folder
   const tone = row => row[at.status] === "failed" || row[at.run_verdict] === "ERROR" ? "bad"
-    : row[at.verdict] === "none" || (row[at.verdict] === "" && row[at.run_verdict] === "OK") ? "good" : "warn";
+    : row[at.verdict] + row[at.run_verdict] !== "" && ["", "none"].includes(row[at.verdict]) && ["", "OK"].includes(row[at.run_verdict]) ? "good" : "warn";
   const time = s => s === "" ? "" : s < earliest ? "clock not set" : new Date(1000 * s).toISOString().replace("T", " ").slice(0, 19);
   const make = (tag, name, text = "") => { const e = document.createElement(tag); e.className = name; e.textContent = text; return e; };
 
@@ -129,12 +129,12 @@
     const times = canvas.members.map(i => rows[i][at.started_ns]), low = Math.min(...times), span = Math.max(...times) - low;
     const spread = low < earliest || span === 0, n = times.length;
     const along = k => spread ? (k + 0.5) / n : (times[k] - low) / span;
-    const error = i => rows[i][at.error_before_m] || rows[i][at.rmse_m] || 0, top = Math.max(...canvas.members.map(error)) || 1;
+    const known = i => rows[i][at.error_before_m] || rows[i][at.rmse_m], error = i => known(i) || 0, top = Math.max(...canvas.members.map(error)) || 1;
     canvas.places = canvas.members.map((i, k) => [10 + (w - 20) * along(k), h - 6 - (h - 14) * error(i) / top]);
     canvas.members.forEach((i, k) => {
       const [x, y] = canvas.places[k], after = rows[i][at.error_after_m];
       g.fillStyle = g.strokeStyle = css(`--${tone(rows[i])}`);
-      mark(g, tone(rows[i]), x, y);
+      if (known(i)) mark(g, tone(rows[i]), x, y); else g.fillText("?", x - 3, y);  // no error is not the least one
       if (after !== "") { const z = h - 6 - (h - 14) * after / top; g.beginPath(); g.moveTo(x, y); g.lineTo(x, z); g.moveTo(x - 4, z); g.lineTo(x + 4, z); g.stroke(); }
     });
   }
