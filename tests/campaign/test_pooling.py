@@ -144,8 +144,11 @@ def test_what_all_takes_of_one_phantom_have_is_its_own_among_few_recordings() ->
 MU, PRIOR, RELATIVE = 0.3, 0.5, 0.02  # a friction, its prior's sigma and what single recordings know it to
 
 
-def kept(root: Path, name: str, phantom: str, values: Mapping[str, tuple[float, float, float]]) -> Job:
-    """A job that is done, whose diagnosis kept of each effect its value, the error of that and what is declared."""
+def kept(
+    root: Path, name: str, phantom: str, values: Mapping[str, tuple[float, float, float]], of: float = np.nan
+) -> Job:
+    """A job that is done, whose diagnosis kept of each effect its value, the error of that and what is declared; a
+    ratio is ``of`` what is declared."""
     folder = root / name
     (folder / "diagnosis").mkdir(parents=True)
     (folder / ROW).write_bytes(b"")
@@ -156,6 +159,7 @@ def kept(root: Path, name: str, phantom: str, values: Mapping[str, tuple[float, 
         folder / "diagnosis" / "linearised.npz", G=np.diag(weight), b=weight * list(z.values()), effect=list(values),
         parameter=[columns[x][0] for x in values], index=[-1] * len(values), sigma=[columns[x][1] for x in values],
         transform=[columns[x][2] for x in values], neutral=[at for _, _, at in values.values()],
+        **({"of": [of] * len(values)} if np.isfinite(of) else {}),
     )  # fmt: skip
     recording = CampaignRecording(name=name, experiment=Path("e"), bag=Path("b"), phantom=phantom, rig="1")
     return Job(recording, folder)
@@ -199,6 +203,21 @@ def test_a_shared_value_is_the_same_whatever_is_declared(tmp_path: Path, elsewhe
             assert values == pytest.approx([mu], abs=0.03)  # measured 0.007
         else:
             assert not values and own == pytest.approx({"p0": mu}, abs=0.06)  # measured 0.015
+
+
+@pytest.mark.parametrize("declared", [(4000.0, 5000.0, 16000.0), (4000.0, 16000.0)])
+def test_ratios_to_other_declared_moduli_are_of_the_same_gel(tmp_path: Path, declared: Sequence[float]) -> None:
+    """A gel of 8 kPa, declared in two or three ways, had no cause in common, and twice of 4 and twice of 8 kPa one."""
+    moduli = {f"{e:.0f}-{k}": e for e in declared for k in range(3)}
+    gel = [kept(tmp_path / "gel", name, "gel", {"stiffness": (8000.0 / e, 0.03, 1.0)}, e) for name, e in moduli.items()]
+    right = [kept(tmp_path / "gel", f"p{k}", f"p{k}", {"stiffness": (1.0, 0.03, 1.0)}, 4000.0) for k in range(5)]
+    (cause,) = pooled(gel + right, tmp_path / "gel")["shared"]
+    (ratio,) = cause["parameters"]
+    assert cause["n_members"] == len(gel)
+    assert (ratio["value"], ratio["of"]) == (pytest.approx(2.0, rel=0.02), 4000.0)
+    assert cause["said"][0].endswith(" of 4000")
+    twice = [kept(tmp_path / "two", name, "gel", {"stiffness": (2.0, 0.03, 1.0)}, e) for name, e in moduli.items()]
+    assert all(both["n_members"] < len(twice) for both in pooled(twice, tmp_path / "two")["shared"])
 
 
 def test_in_common_units_a_recording_says_what_it_said() -> None:

@@ -30,13 +30,15 @@ UNREADABLE = (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.
 @dataclass(frozen=True)
 class Label:
     """One amplitude: its ``parameter``, its ``index`` in it (-1: a scalar), and its coordinate as in
-    `closed_loop.candidates.Coordinate`, in sigmas from ``neutral``."""
+    `closed_loop.candidates.Coordinate`, in sigmas from ``neutral``; ``of``: what it is a ratio to, NaN where to
+    nothing or nobody says."""
 
     parameter: str
     index: int
     sigma: float
     transform: str
     neutral: float
+    of: float = float("nan")
 
     def value(self, x: float) -> float:
         """Return the parameter's value at the amplitude ``x``, in sigmas."""
@@ -143,7 +145,9 @@ def read_evidence(path: Path, name: str, phantom: str, rig: str) -> KeptEvidence
         effects = kept["effect"].astype(str)
         sigma = kept["sigma"].astype(float)
         parts = (kept["parameter"].astype(str), kept["index"], sigma, kept["transform"].astype(str), kept["neutral"])
-        labels = [Label(str(p), int(i), float(s), str(t), float(n)) for p, i, s, t, n in zip(*parts, strict=True)]
+        of = kept["of"] if "of" in kept else np.full(len(effects), np.nan)
+        rows = zip(*parts, of, strict=True)
+        labels = [Label(str(p), int(i), float(s), str(t), float(n), float(o)) for p, i, s, t, n, o in rows]
         G, b = kept["G"] * np.outer(sigma, sigma), kept["b"] * sigma
         shapes = _read_shapes(kept)
     columns = {effect: np.flatnonzero(effects == effect) for effect in dict.fromkeys(effects.tolist())}
@@ -228,14 +232,36 @@ def _near(places: Array) -> list[list[int]]:
 
 def in_common_units(evidence: Iterable[KeptEvidence]) -> list[KeptEvidence]:
     """Bring all recordings to the widest prior of each amplitude, as experiments state some of them better, and to the
-    neutral value that most have, as what is declared may differ; what amplitudes of other things are is told apart."""
-    all_ = told_apart(list(evidence))
+    neutral value that most have, as what is declared may differ, ratios to what most declare; what amplitudes of
+    other things are is told apart."""
+    all_ = _to_the_same(told_apart(list(evidence)))
     widest: dict[str, Array] = {}
     for effect in dict.fromkeys(x for e in all_ for x in e.labels):
         of_each = [[label.sigma for label in e.labels[effect]] for e in all_ if effect in e.labels]
         widest[effect] = np.max(of_each, axis=0)
     neutral = {effect: _usual_neutral(all_, effect) for effect in widest}
     return [_in_units(e, widest, neutral) for e in all_]
+
+
+def _to_the_same(evidence: Sequence[KeptEvidence]) -> list[KeptEvidence]:
+    """State ratios to what is declared as ratios to what most recordings declare of it; the first of equals."""
+    known = Counter((x, k, label.of) for e in evidence for x, own in e.labels.items() for k, label in enumerate(own))
+    usual = {(x, k): of for (x, k, of), _ in reversed(known.most_common()) if np.isfinite(of)}
+    return [
+        replace(
+            e,
+            labels={
+                x: tuple(_ratio_to(label, usual.get((x, k), label.of)) for k, label in enumerate(own))
+                for x, own in e.labels.items()
+            },
+        )
+        for e in evidence
+    ]
+
+
+def _ratio_to(label: Label, of: float) -> Label:
+    """Return a label as a ratio to ``of`` where it says what it is a ratio to."""
+    return label if not np.isfinite(label.of) else replace(label, neutral=label.neutral * label.of / of, of=of)
 
 
 def _usual_neutral(evidence: Sequence[KeptEvidence], effect: str) -> tuple[float, ...]:

@@ -104,6 +104,7 @@ def document(s: Shared, evidence: Sequence[KeptEvidence]) -> dict[str, Any]:
             "value": label.value(float(s.value[k])),
             "interval_95": _ends(label, s.value[k], INTERVAL * sigma[k]),
             "takes_95": _ends(label, s.value[k], s.ahead[k]),
+            "of": label.of,
         }
         for k, label in enumerate(labels)
     ]
@@ -133,8 +134,9 @@ def _usual_shape(shapes: Sequence[Sequence[KeptShape]]) -> list[dict[str, Any]]:
 
 
 def _unit(effect: str, parameter: Mapping[str, Any]) -> str:
-    """Return the unit of a parameter of an effect as it stands behind its value."""
-    return unit_words(effect, str(parameter["name"]).partition("[")[0])
+    """Return the unit of a parameter of an effect as it stands behind its value, or what it is a ratio to."""
+    of = f" of {parameter['of']:g}" if np.isfinite(parameter.get("of", np.nan)) else ""
+    return unit_words(effect, str(parameter["name"]).partition("[")[0]) + of
 
 
 def _name(label: Label | KeptShape) -> str:
@@ -171,7 +173,12 @@ def _told(effect: str, labels: Sequence[Label], values: Array, variances: Array)
     return {
         "effect": effect_of(effect),
         "parameters": [
-            {"name": _name(label), "value": label.value(float(x)), "interval_95": _ends(label, x, INTERVAL * sigma)}
+            {
+                "name": _name(label),
+                "value": label.value(float(x)),
+                "interval_95": _ends(label, x, INTERVAL * sigma),
+                "of": label.of,
+            }
             for label, x, sigma in zip(labels, values, np.sqrt(variances), strict=True)
         ],
     }

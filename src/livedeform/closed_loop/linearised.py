@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from livedeform.closed_loop.candidates import Candidate, Coordinate
 from livedeform.closed_loop.evidence.noise import Nuisance, join
 from livedeform.closed_loop.inference.forward_selection import Linearised, Selection, entries_of
 from livedeform.closed_loop.inference.gauss_newton import Fit, Problem, Ridge, normal_equations
+from livedeform.common.experiment.schema import Experiment
 from livedeform.common.types import Array
 
 
@@ -39,12 +41,24 @@ class KeptEffect:
         return [(c, c.value(z)) for c, z in chosen]
 
 
-def write_linearised(selection: Selection, path: Path) -> bool:
-    """Write the normal equations of all candidates' amplitudes; False where nothing was linearised."""
+def write_linearised(selection: Selection, path: Path, experiment: Experiment | None = None) -> bool:
+    """Write the normal equations of all candidates' amplitudes, and ``of``, what the ``experiment`` declares of that
+    which a ratio is of (NaN: none); False where nothing was linearised."""
     if selection.first is None:
         return False
-    np.savez_compressed(path, **normal_equations_of(selection))
+    said = normal_equations_of(selection)
+    names = zip(said["effect"].tolist(), said["parameter"].tolist(), strict=True)
+    of = [_declared(experiment, selection.candidates.get(effect), parameter) for effect, parameter in names]
+    np.savez_compressed(path, **said, of=np.array(of, float))
     return True
+
+
+def _declared(experiment: Experiment | None, candidate: Candidate | None, parameter: str) -> float:
+    """Return what an experiment declares of that which a candidate's parameter is a ratio to; NaN where it is none."""
+    found = [] if candidate is None else [p for p in candidate.info.parameters if p.name == parameter]
+    if experiment is None or not found or not found[0].stated_by or found[0].neutral != 1.0:
+        return float("nan")
+    return float(attrgetter(found[0].stated_by)(experiment))
 
 
 def normal_equations_of(selection: Selection) -> dict[str, Any]:

@@ -29,7 +29,7 @@ def write_diagnosis(result: Diagnosis, inputs: Inputs, out: Path) -> None:
     out.mkdir(parents=True, exist_ok=True)
     (out / "diagnosis.json").write_text(json.dumps(as_json(result), indent=2) + "\n")
     (out / "settings.json").write_text(json.dumps(inputs.settings.as_dict(), indent=2) + "\n")
-    write_linearised(result.selection, out / "linearised.npz")
+    write_linearised(result.selection, out / "linearised.npz", inputs.experiment)
     if result.baselines is not None:
         (out / "baselines.json").write_text(json.dumps(result.baselines.as_dict(), indent=2) + "\n")
     if inputs.experiment is not None:
