@@ -185,6 +185,35 @@ def test_standard_deviations_that_nothing_uses_are_told(change):
     assert finding.level == "NOTE" and unused in finding.text
 
 
+@pytest.mark.parametrize(
+    ("key", "value", "says"),
+    [
+        ("thresholds", {"error": 0.02}, "thresholds.error is 20 mm, of a body of"),
+        ("phantom.gravity", [0.0, 0.0, -1.0], "phantom.gravity is 1 m/s2"),
+    ],
+)
+def test_what_is_in_another_unit_by_all_likelihood_is_doubted(change, key, value, says):
+    experiment = load_experiment(change(key, value))
+    found = [f for f in check_declared(experiment, read_body(experiment)) if f.level == "WARN"]
+    assert any(says in f.text for f in found)
+
+
+@pytest.mark.parametrize(("key", "value"), [("thresholds", {"error": 0.005}), ("phantom.gravity", [0.0, 0.0, 0.0]),
+                                            ("phantom.gravity", [9.81, 0.0, 0.0])])  # fmt: skip
+def test_what_is_usual_is_not_doubted(change, key, value):
+    experiment = load_experiment(change(key, value))
+    assert all(f.level == "NOTE" for f in check_declared(experiment, read_body(experiment)))
+
+
+def test_a_threshold_and_places_of_markers_in_millimetres_are_refused(folder, change):
+    """Of a body of 98 mm, 0.1 m; up to the body's own size they were taken as they are, and everything was OK."""
+    change("thresholds", {"error": 0.05})
+    assert "error is 0.05 m, but the body is 0.0985 m across" in complaint(folder)
+    change("thresholds", {"error": 0.005})
+    (folder / "markers.csv").write_text("id,x,y,z,sigma\n1,0,0,0.05,0.05\n")
+    assert "sigma is 0.05 m" in complaint(folder)
+
+
 def test_those_that_are_said_to_be_used_are(change):
     stated = {p.stated_by for effect in EFFECTS.values() for p in effect.INFO.parameters if p.stated_by}
     assert {*stated, "timeline.release"} == set(USED_SIGMAS)
@@ -402,7 +431,15 @@ def test_whether_kinds_are_stated_is_told_by_the_columns(folder, header):
 
 
 @pytest.mark.parametrize(
-    ("name", "wanted"), [("kinds", "kind"), ("Knid", "kind"), ("sigmas", "sigma"), ("sgima", "sigma")]
+    ("name", "wanted"),
+    [
+        ("kinds", "kind"),
+        ("Knid", "kind"),
+        ("sigmas", "sigma"),
+        ("sgima", "sigma"),
+        ("sigma_mm", "sigma"),
+        ("sigma (mm)", "sigma"),
+    ],
 )
 def test_a_mistyped_column_is_not_left_out_in_silence(folder, name, wanted):
     (folder / "markers.csv").write_text(f"id,x,y,z,{name}\n1,0,0,0.02,\n")

@@ -447,8 +447,8 @@ def live(
     earlier_poses(after, time.time_ns(), experiment.timeline.release)
     options = {"experiment": experiment_path, "out": out, "nodes": list(names), "after": list(after)}
     about = outputs.configuration("live", options | {"model": model, "expected": expected})
-    inputs = [*files_of(experiment), model, *after, expected]
-    with outputs.prepared(out, WRITES, force=force, inputs=inputs, in_place=True) as draft:
+    read = [*files_of(experiment), model, *after, expected]
+    with outputs.prepared(out, WRITES, force=force, inputs=read, in_place=True) as draft:
         if draft != out:
             tell(f"the earlier results stay until this session ends; until then it is recorded in {draft}")
         keep_experiment(experiment, draft)
@@ -472,9 +472,8 @@ def live(
                     *check_recording(recording, experiment),
                     *(_several(topic, n) for topic, n in counts["publishers"].items()),
                 ]
-                bound, mesh = nodes.interpolation_bound, nodes.mesh
-                head = _head(experiment, "live", False, mesh, _heard(draft / "run.mcap"))
-                begin_ns = recording.start_ns  # by the stamps, which may be another clock's
+                head = _head(experiment, "live", False, nodes.mesh, _heard(draft / "run.mcap"))
+                begin_ns, bound = recording.start_ns, nodes.interpolation_bound  # by stamps, maybe of another clock
                 metrics = write_results(draft, experiment, counts, begin_ns, bound, head, findings, recording)
         write_report(draft, experiment, tell)
     return metrics

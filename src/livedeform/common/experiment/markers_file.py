@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import re
 from collections.abc import Sequence
 from difflib import SequenceMatcher
 from pathlib import Path
@@ -72,13 +73,16 @@ def _columns(names: Sequence[str], path: Path) -> list[str]:
     for wanted in OPTIONAL:
         near = [name for name in columns if name != wanted and _mistyped(name.lower(), wanted)]
         if near and wanted not in columns:
-            what = f"a column '{near[0]}' is not read"
-            raise InputError(what, where=str(path), remedy=f"call it {wanted} if that is meant, or else otherwise")
+            what, meant = f"a column '{near[0]}' is not read", f"call it {wanted} (lengths in metres) if that is meant"
+            raise InputError(what, where=str(path), remedy=f"{meant}, or else otherwise")
     return columns
 
 
 def _mistyped(name: str, wanted: str) -> bool:
-    """Tell whether a name is the wanted one with letters exchanged, or with one too many or too few."""
+    """Tell whether a name is the wanted one with a unit behind it, with letters exchanged, or with one too many or too
+    few."""
+    if re.fullmatch(rf"{wanted}[ _.(\[]+(mm|cm|m|um|µm)[)\]]?", name):
+        return True
     return sorted(name) == sorted(wanted) or SequenceMatcher(None, name, wanted).ratio() > NEAR
 
 

@@ -14,6 +14,7 @@ SMALLEST_BODY = 0.003  # m
 LARGEST_BODY = 3.0  # m
 MAX_TETRAHEDRA = 5e6
 FAR_FRACTION = 0.25  # of the body's diagonal: a marker farther off is not carried by the body
+LARGEST_ERROR = 0.25  # of the diagonal: an error that is larger says nothing of where a marker is
 SUPPORT_REACH = 10.0  # markers on the support may be that much farther off
 TIMES_THE_BODY, LARGEST_BESIDE = 5.0, 0.5  # of the diagonal, m: plates are larger than what they press, and tools long
 LARGEST_FITTED = 0.1  # m; up to here a fit may make a region larger than a small body
@@ -163,10 +164,11 @@ def _check_lengths(experiment: Experiment, surface: Surface) -> None:
     """Refuse lengths that are millimetres by all likelihood: of what lies in the body, and of what presses on it."""
     across = surface.diagonal
     lengths = [(f"phantom.lesions.{i}.diameter", x.diameter) for i, x in enumerate(experiment.lesions)]
-    lengths += [("thresholds.error", experiment.thresholds.error)]
     sigmas = experiment.markers.sigmas[np.isfinite(experiment.markers.sigmas)]
-    if len(sigmas) and sigmas.max() > across:
+    if len(sigmas) and sigmas.max() > LARGEST_ERROR * across:
         _refuse_length(str(experiment.phantom.markers), "sigma", float(sigmas.max()), surface)
+    if experiment.thresholds.error > LARGEST_ERROR * across:
+        _refuse_length(_where(experiment, "thresholds.error"), "error", experiment.thresholds.error, surface)
     for key, length in lengths:
         if length > across:
             _refuse_length(_where(experiment, key), key.rpartition(".")[2], length, surface)
