@@ -15,6 +15,7 @@ from livedeform.common.bags.pictures import read_camera_info
 from livedeform.common.bags.read import BagReader, read_bag
 from livedeform.common.bags.recording import Recording, header_stamp_ns, load_recording, to_image
 from livedeform.common.bags.types import RawMessage, decode
+from livedeform.common.checks.clocks import OFFSET_DRIFT
 from livedeform.common.checks.declared import check_declared
 from livedeform.common.checks.finding import Finding, Severity
 from livedeform.common.checks.protocol import ProtocolStep, protocol
@@ -29,7 +30,6 @@ GAP_FACTOR = 3.0  # an interval this many times the median counts as a gap
 MIN_GAP = 0.02  # s
 CLOCK_SET_NS = 10**17  # March 1973: a clock that shows less was never set
 LARGE_OFFSET = 1.0  # s between stamp and receive time
-OFFSET_DRIFT = 0.1  # s by which that offset may change within a recording
 DECODED = (t.STEREO_MARKERS, t.PROBE_POSE, t.PROBE_WRENCH)  # message by message; pictures would take too long
 STREAMS = (t.STEREO_MARKERS, t.STEREO_SURFACE, t.PROBE_POSE, *t.IMAGES, *t.COMPRESSED_IMAGES)
 # what every diagnosis.json has (interfaces, section 5)

@@ -13,7 +13,7 @@ from livedeform.common.bags import layouts
 from livedeform.common.bags.recording import header_stamp_ns, load_recording, own_name, read_images
 from livedeform.common.bags.recording_writer import RecordingWriter
 from livedeform.common.bags.write import BagWriter
-from livedeform.common.checks.recorded import check_frames
+from livedeform.common.checks.recorded import check_faults, check_frames
 from livedeform.common.errors import RecordingError
 from livedeform.common.experiment.yaml_file import load_experiment
 from livedeform.common.types import CameraCalibration, Image, MarkerFrame, Pose, Wrench
@@ -84,13 +84,60 @@ def test_frames_come_in_the_order_of_their_stamps_and_once(write):
 
 
 def test_markers_that_cannot_be_used_are_left_out(write, folder):
-    points = [[0, 0, 0.05], [np.nan, 0, 0], [0.0, 0, 0], [0, 0, 0.01]]
-    path = write(("marker_frame", frame(10, [5, 1, 99, 5], points)))
+    points = [[0, 0, 0.05], [np.nan, 0, 0], [0.0, 0, 0], [0, 0, 0.01], [0, 0, 0.02]]
+    path = write(("marker_frame", frame(10, [5, 1, 99, 7, 7], points)))
     recording = load_recording(path, load_experiment(folder))
     assert recording.marker_frames[0].ids.tolist() == [5]
     assert recording.marker_frames[0].points.shape == (1, 3)
     assert len([line for line in recording.warnings if "left out in some frames" in line]) == 3
     assert load_recording(path).marker_frames[0].ids.tolist() == [5, 99]
+
+
+@pytest.mark.parametrize("places", ["apart", "together", "one is not finite"])
+def test_of_two_markers_with_one_id_neither_is_known(places, write):
+    """The first counted, and turned an error of 0.09 mm into one of 1.5 mm. Live it is the same, frame by frame."""
+    points = np.array([[0.0, 0, 0.05], [0.01, 0, 0.05], [0.02, 0, 0.05], [0.03, 0, 0.05]])
+    points[3] = {"apart": points[3], "together": points[1], "one is not finite": [np.nan, 0, 0]}[places]
+    sent = frame(10, [5, 7, 9, 7], points)
+    recording = load_recording(write(("marker_frame", sent), ("marker_frame", replace(sent, stamp_ns=20))))
+    read = layouts.unpack_marker_frame(10, layouts.pack_marker_frame(sent))
+    kept = [5, 7, 9] if places == "one is not finite" else [5, 9]
+    assert [f.ids.tolist() for f in recording.marker_frames] == [kept, kept]
+    assert read.ids[np.isfinite(read.points).all(axis=1)].tolist() == kept
+    assert len(read.ids) == len(read.points) == len(read.covariances) == len(read.reprojection_error_px)
+    found = [f for f in check_faults(recording, None, None) if "there twice" in f.text]  # type: ignore[arg-type]
+    assert [f.level == "WARN" and f.doubts for f in found] == [True] * (len(kept) == 2)
+
+
+MOVED = {"by 20 mm": (0.02, 0.0), "by 1 mm": (0.001, 0.0), "by a degree": (0.0, 0.0175), "not at all": (1e-6, 1e-5)}
+
+
+@pytest.mark.parametrize("name", MOVED)
+def test_cameras_that_are_said_to_be_elsewhere_in_between_are_doubted(name, write):
+    """The last place counted for the whole recording, without a word."""
+    by, angle = MOVED[name]
+    turn = np.array([0.0, 0.0, np.sin(0.5 * angle), np.cos(0.5 * angle)])
+    places = [Pose(0, np.array([0.0, 0.0, 0.35]), STILL), Pose(0, np.array([by, 0.0, 0.35]), -turn)]
+    other = [{("base", "tool"): Pose(0, np.array([0.1 * k, 0.0, 0.0]), STILL)} for k in range(2)]  # of nobody's
+    said = [({(t.FRAME_PHANTOM, t.FRAME_LEFT): place} | more) for place, more in zip(places, other, strict=True)]
+    recording = load_recording(write(*[("static_transforms", each, 10 * k) for k, each in enumerate(said)]))
+    found = [f for f in check_faults(recording, None, None) if "cameras" in f.text]  # type: ignore[arg-type]
+    assert [f.level == "WARN" and f.doubts for f in found] == [True] * (name != "not at all")
+
+
+def test_a_pause_of_hours_is_noted_and_a_stretch_that_goes_is_doubted(tmp_path):
+    for wrong, n, level in ((0, 105, "NOTE"), (3 * 3600 * 10**9, 100, "WARN")):
+        with BagWriter(tmp_path / f"{n}.mcap", {}) as file:
+            bag = Late(file)
+            writer = RecordingWriter(bag)
+            for k in range(105):
+                bag.now_ns = 10**18 + k * 50_000_000 + (2 * 3600 * 10**9 if k >= 100 and not wrong else 0)
+                writer.pose(Pose(bag.now_ns + wrong * (k >= 100), np.zeros(3), STILL))
+        recording = load_recording(tmp_path / f"{n}.mcap")
+        assert len(recording.poses) == n
+        (found,) = check_faults(recording, None, None)  # type: ignore[arg-type]
+        assert found.level == level and found.doubts == (level == "WARN")
+        assert ("pauses" if level == "NOTE" else "cannot be right") in found.text
 
 
 def test_poses_that_are_none_are_left_out(write):

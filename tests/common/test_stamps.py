@@ -5,7 +5,16 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from livedeform.common.stamps import StampClock, StampGate, StampKind, StampOrder, bad_stamps, times_set_back
+from livedeform.common.stamps import (
+    StampClock,
+    StampGate,
+    StampKind,
+    StampOrder,
+    bad_stamps,
+    in_stretches,
+    long_pauses,
+    times_set_back,
+)
 
 S = 1_000_000_000
 YEAR = 365 * 86_400 * S
@@ -41,6 +50,47 @@ def test_pauses_drifts_and_slow_playing_are_no_bad_stamps():
     assert not bad_stamps(GOOD, drifting).any()
     assert not bad_stamps(GOOD, [GOOD[0] + k * 2 * S + (k % 3) * S for k in range(60)]).any()
     assert not bad_stamps(paused, GOOD).any()  # the clock was set once
+
+
+HOUR, DAY = 3600 * S, 86_400 * S
+
+
+def after_pauses(sizes: list[int], pause: int) -> list[int]:
+    """Stamps in parts of so many, each a ``pause`` after the one before."""
+    return [GOOD[0] + part * pause + k * S // 20 for part, n in enumerate(sizes) for k in range(n)]
+
+
+@pytest.mark.parametrize("sizes", [[100, 5], [5, 100], [100, 2], [4, 100, 4], [5] * 20], ids=str)
+@pytest.mark.parametrize("pause", [2 * HOUR, DAY])
+@pytest.mark.parametrize("late", [0, S // 100, 5 * HOUR])
+def test_a_pause_of_hours_that_both_clocks_tell_loses_nothing(sizes: list[int], pause: int, late: int):
+    """The shorter part was left out, and of twenty parts nineteen. However late all messages come."""
+    stamps = after_pauses(sizes, pause)
+    assert not bad_stamps(stamps, [stamp + late for stamp in stamps]).any()
+    assert long_pauses(stamps) == len(sizes) - 1 and long_pauses(stamps[: sizes[0]]) == 0
+
+
+@pytest.mark.parametrize("wrong", [2 * HOUR, -2 * HOUR, DAY, -3 * YEAR])
+def test_a_jump_of_one_clock_alone_is_no_pause(wrong: int):
+    """Five messages of which receive times tell nothing: a whole stretch goes, and is counted as one."""
+    stamps = [stamp + wrong * (10 <= k < 15) for k, stamp in enumerate(GOOD)]
+    bad = bad_stamps(stamps, GOOD)
+    assert np.flatnonzero(bad).tolist() == list(range(10, 15))
+    assert in_stretches(bad).sum() == 5
+
+
+def test_a_clock_that_was_never_set_is_no_pause():
+    """Receive times that were written offline go with the stamps, in 1970 as well."""
+    stamps = [k * S for k in range(5)] + GOOD
+    bad = bad_stamps(stamps, stamps)
+    assert np.flatnonzero(bad).tolist() == list(range(5))
+
+
+def test_single_faults_are_no_stretch():
+    bad = np.zeros(20, bool)
+    bad[[0, 3, 4, 9, 10, 11, 19]] = True
+    assert np.flatnonzero(in_stretches(bad)).tolist() == [9, 10, 11]
+    assert not in_stretches(np.zeros(0, bool)).any() and in_stretches(np.ones(3, bool)).all()
 
 
 @pytest.mark.parametrize("at", [1, 30, 58])

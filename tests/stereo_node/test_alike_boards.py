@@ -8,6 +8,7 @@ from scene import make_test_rig
 from scipy.spatial.transform import Rotation
 
 from livedeform.common.errors import CalibrationError
+from livedeform.common.experiment.surface import Surface
 from livedeform.common.experiment.yaml_file import Markers
 from livedeform.common.frames import apply, inverse, transform
 from livedeform.common.types import Image
@@ -17,17 +18,19 @@ from livedeform.stereo_node.calibrate.calibrate import calibrate
 from livedeform.stereo_node.detect.settings import DetectorSettings
 from livedeform.stereo_node.discs.outlines import area_centre
 from livedeform.stereo_node.pipeline import StereoTracker, TrackerSettings
-from livedeform.stereo_node.track.register import RegistrationError, register_either_way, register_named
+from livedeform.stereo_node.track.register import RegistrationError, register, register_either_way, register_named
+from livedeform.stereo_node.track.sides import outward_side
 
 SQUARE, PX = 0.015, 40  # m, fine pixels
+UP = np.array([0.0, 0.0, 1.0])
 RIG = make_test_rig(960, 720, 800.0, 0.1)
 
 
 def flat(board: Board) -> np.ndarray:
     """A board's own picture, with two squares of margin; its first point is ``2 * PX`` from the corner."""
-    h, w = (board.rows + 3) * PX, (board.columns + 3) * PX
+    w, h = np.round(board.points[-1, :2] / SQUARE + 4).astype(int) * PX
     picture = np.full((h, w), 230, np.uint8)
-    if board.kind == "circles":
+    if "circles" in board.kind:
         for x, y in board.points[:, :2] / SQUARE + 2:
             cv2.circle(picture, (round(x * PX), round(y * PX)), 12, 25, -1, cv2.LINE_AA)
     else:
@@ -38,7 +41,7 @@ def flat(board: Board) -> np.ndarray:
 
 def seen(board: Board, T_left_board: np.ndarray) -> list[np.ndarray]:
     """The board in the left and the right picture (OpenCV's warp)."""
-    first = 2 * PX - (0.0 if board.kind == "circles" else 0.5)  # edges are between fine pixels
+    first = 2 * PX - (0.0 if "circles" in board.kind else 0.5)  # edges are between fine pixels
     to_board = np.linalg.inv([[PX / SQUARE, 0, first], [0, PX / SQUARE, first], [0, 0, 1]])
     out = []
     for camera, T in ((RIG.left, T_left_board), (RIG.right, RIG.T_right_left @ T_left_board)):
@@ -58,9 +61,13 @@ def poses(board: Board, n: int, seed: int) -> list[np.ndarray]:
     return out
 
 
-@pytest.mark.parametrize(("kind", "columns", "rows"), [("circles", 7, 6), ("circles", 6, 6), ("checkerboard", 8, 6)])
+FACES = (("circles", 7, 6), ("circles", 6, 6), ("checkerboard", 8, 6), ("acircles", 4, 10), ("acircles", 4, 9))
+
+
+@pytest.mark.parametrize(("kind", "columns", "rows"), FACES)
 def test_both_pictures_count_from_one_end(kind: str, columns: int, rows: int):
-    """And from the front: OpenCV counts grids of circles mirrored in 9 of 24 pictures, in one of a pair at times."""
+    """And from the front: OpenCV counts grids of circles mirrored in 9 of 24 pictures, in one of a pair at times,
+    and every second row of an asymmetric one before the one above it."""
     board = Board(kind, columns, rows, SQUARE)
     pairs = find_pairs([(str(k), *seen(board, T)) for k, T in enumerate(poses(board, 10, 0))], board)
     assert len(pairs) == 10
@@ -145,7 +152,7 @@ def test_markers_of_a_board_are_never_turned(kind: str, columns: int, rows: int)
     for azimuth in (0, 45, 180):
         T_left_phantom = looking_at_the_middle(azimuth)
         given = StereoTracker(RIG, markers, TrackerSettings(detector=detector), T_phantom_left=inverse(T_left_phantom))
-        found = StereoTracker(RIG, markers, TrackerSettings(detector=detector))
+        found = StereoTracker(RIG, markers, TrackerSettings(detector=detector), outward=UP)
         for k, x in enumerate((0.0, 0.003)):
             pair = [
                 Image(10**9 + k * 33_000_000, p)
@@ -160,6 +167,89 @@ def test_markers_of_a_board_are_never_turned(kind: str, columns: int, rows: int)
                 error = frame.points - points[frame.ids] - [x, 0, 0]
                 assert np.linalg.norm(error.mean(axis=0)) < 5e-5  # m; measured 2.7e-5
                 assert np.abs(error).max() < 5e-4  # m; measured 2.8e-4
+
+
+@pytest.mark.parametrize(("columns", "rows"), [(9, 6), (6, 9)])
+@pytest.mark.parametrize("natural", [False, True])
+def test_a_press_goes_into_the_body_however_a_board_is_numbered(columns: int, rows: int, natural: bool):
+    """By -3 mm along z it was +3 mm, with level ok, of places that run to the right and up with z up: a flat pattern
+    fits mirrored as a half turn out of its plane. The side that the cameras see decides."""
+    board, down = Board("checkerboard", columns, rows, SQUARE), np.diag([1.0, -1.0, -1.0])
+    detector = TrackerSettings(detector=DetectorSettings(type="checkerboard", board=f"{columns}x{rows}"))
+    T = transform(down, -down @ board.points.mean(axis=0))  # T_phantom_board
+    places = apply(T, board.points)[board.mirrored[0] if natural else slice(None)]
+    n = len(places)
+    markers = Markers(np.arange(n, dtype=np.uint32), places, np.full(n, np.nan), np.array(["surface"] * n))
+    for azimuth in (0, 200):
+        T_left_phantom = looking_at_the_middle(azimuth)
+        given = StereoTracker(RIG, markers, detector, T_phantom_left=inverse(T_left_phantom))
+        found, blind = StereoTracker(RIG, markers, detector, outward=UP), StereoTracker(RIG, markers, detector)
+        for k, moved in enumerate(([0, 0, 0], [0, 0, -0.003], [0.002, 0.001, -0.003])):
+            pictures = seen(board, T_left_phantom @ transform(np.eye(3), moved) @ T)
+            pair = [Image(10**9 + k * 33_000_000, picture) for picture in pictures]
+            for tracker in (given, found):
+                frame, status = tracker.process(*pair)
+                assert status.level == "ok" and len(frame.ids) == n
+                error = (frame.points - places[frame.ids]).mean(axis=0) - moved
+                assert np.linalg.norm(error) < 1e-4  # m; measured 4e-5
+            _, status = blind.process(*pair)
+            assert status.level == "error" and "which side of it is out of the body is not known" in status.message
+
+
+def test_places_of_flat_dots_that_are_mirrored_are_refused():
+    """An axis that runs the wrong way fits as a half turn: the cameras came out below the body, with level ok."""
+    rng = np.random.default_rng(0)
+    places = np.column_stack([rng.uniform(-0.04, 0.04, (20, 2)), rng.normal(0, 5e-5, 20)])
+    points = apply(looking_at_the_middle(0), places) + rng.normal(0, 2e-5, places.shape)
+    noise = np.tile(np.eye(3) * 4e-10, (20, 1, 1))
+    found = register(points, noise, places, 1e-3, outward=UP)
+    assert np.allclose(found.T_phantom_left, inverse(looking_at_the_middle(0)), atol=1e-3)  # measured 3e-4
+    for axis in range(2):
+        mirrored = places * np.where(np.arange(3) == axis, -1, 1)
+        with pytest.raises(RegistrationError, match="only as seen from inside the body"):
+            register(points, noise, mirrored, 1e-3, outward=UP)
+        rows = np.arange(20)
+        with pytest.raises(RegistrationError, match="only as seen from inside the body"):
+            register_either_way(points, noise, mirrored, [rows], 6e-3, outward=UP)
+
+
+def test_flat_dots_that_are_their_own_mirror_image_are_known_by_the_side():
+    """A triangle and its mirror image fit in two ways, of which the cameras see one."""
+    half = np.array([[0.0, 0.03, 0], [0.01, 0.02, 0], [0.02, -0.01, 0], [0.035, -0.03, 0]])
+    places = np.vstack([half, half[1:] * [-1, 1, 1]])
+    points, noise = apply(looking_at_the_middle(0), places), np.tile(np.eye(3) * 4e-10, (7, 1, 1))
+    with pytest.raises(RegistrationError, match="fits in two ways"):
+        register(points, noise, places, 1e-3)
+    found = register(points, noise, places, 1e-3, outward=UP)
+    np.testing.assert_array_equal(found.marker_rows[np.argsort(found.point_rows)], np.arange(7))
+
+
+@pytest.mark.parametrize("thick", [0.002, 0.05])
+def test_the_bodys_surface_tells_its_side(thick: float):
+    corners = np.array([[x, y, z] for x in (0, 0.1) for y in (0, 0.1) for z in (0, thick)])
+    faces = [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]]
+    body = Surface(corners, np.array([t for a, b, c, d in faces for t in ((a, b, c), (a, c, d))]))
+    assert np.isclose(body.volume, 0.01 * thick)  # outward
+    x, y = np.meshgrid([0.02, 0.05, 0.08], [0.02, 0.05, 0.08])
+    for z, out in ((thick + 3e-4, 1.0), (thick - 3e-4, 1.0), (2e-4, -1.0)):  # declared beside the surface
+        side = outward_side(body, np.column_stack([x.ravel(), y.ravel(), np.full(9, z)]))
+        np.testing.assert_allclose(side, out * UP, atol=1e-9)
+    assert outward_side(body, np.column_stack([x.ravel() + 0.3, y.ravel(), np.full(9, thick)])) is None
+
+
+@pytest.mark.parametrize("off", [0.008, 0.02])
+def test_a_given_pose_that_is_wrong_is_named_where_pictures_name_the_markers(off: float):
+    """By 20 mm: all markers were 19.99 mm beside their places, with level ok."""
+    board, down = Board("checkerboard", 9, 6, SQUARE), np.diag([1.0, -1.0, -1.0])
+    T = transform(down, -down @ board.points.mean(axis=0))
+    places, T_left_phantom = apply(T, board.points), looking_at_the_middle(0)
+    markers = Markers(np.arange(54, dtype=np.uint32), places, np.full(54, np.nan), np.array(["surface"] * 54))
+    detector = TrackerSettings(detector=DetectorSettings(type="checkerboard", board="9x6"))
+    pair = [Image(10**9, picture) for picture in seen(board, T_left_phantom @ T)]
+    wrong = transform(np.eye(3), np.array([off, 0.0, 0.0])) @ inverse(T_left_phantom)
+    frame, status = StereoTracker(RIG, markers, detector, T_phantom_left=wrong).process(*pair)
+    assert status.level == "error" and len(frame.ids) == 0
+    assert f"{off * 1e3:.0f}.0 mm (median) from where they should be; check the given pose" in status.message
 
 
 def test_a_board_on_a_body_that_is_not_symmetric_is_registered():
@@ -177,7 +267,7 @@ def test_a_board_on_a_body_that_is_not_symmetric_is_registered():
     with pytest.raises(
         RegistrationError, match="looks alike from two sides, and fits its places both ways; use a chec"
     ):
-        register_either_way(points, noise, board.points, board.turns, 2e-2)
+        register_either_way(points, noise, board.points, board.turns, 2e-2, outward=-UP)
 
 
 @pytest.mark.parametrize("seen_rows", [np.arange(3), np.arange(7), np.array([0, 8, 16])])

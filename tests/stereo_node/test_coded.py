@@ -85,6 +85,6 @@ def test_tags_are_named_and_measured(kind):
     error = frame.points - markers.points
     assert np.abs(error @ T[:3, :3]).max(axis=0)[:2].max() < 1e-5  # m sideways; measured 2.8e-6
     assert np.abs(error @ T[:3, :3])[:, 2].max() < 5e-5  # m in depth; measured 1.5e-5
-    registered = StereoTracker(rig, markers, settings)
+    registered = StereoTracker(rig, markers, settings, outward=np.array([0.0, 0.0, 1.0]))
     frame, _ = registered.process(draw(rig, T, places, kind, "left", 1), draw(rig, T, places, kind, "right", 1))
     assert np.linalg.norm(frame.points - markers.points, axis=1).max() < 5e-5  # m; measured 1.2e-5

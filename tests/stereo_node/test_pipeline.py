@@ -3,12 +3,15 @@
 import cv2
 import numpy as np
 import pytest
+import trimesh
 from scene import DOME, Look, dome_markers, looking_down, make_test_rig, pair
 from scipy.spatial.transform import Rotation
 
+from livedeform.common.experiment.yaml_file import load_experiment
 from livedeform.common.frames import apply, inverse
 from livedeform.common.types import Image
 from livedeform.stereo_node.calibrate.bundle import Bundle, Lens
+from livedeform.stereo_node.camera.calibration_file import write_camera
 from livedeform.stereo_node.camera.triangulate import triangulate
 from livedeform.stereo_node.detect.settings import DetectorSettings
 from livedeform.stereo_node.pipeline import StereoTracker, TrackerSettings
@@ -159,6 +162,46 @@ def test_painted_discs_are_measured_where_their_middles_are(setup):
     assert abs(outwards) < 5e-6  # measured 2.6e-6 m
     assert inwards < -2.5e-5  # measured -3.3e-5 m: what the correction is for
     assert flat > 40  # measured 82
+
+
+FLAT_TOP = """
+version: 1
+name: block
+phantom:
+  surface: block.stl
+  configuration: unloaded
+  element_size: 0.01
+  density: 1000.0
+  material: {model: neo_hookean, youngs_modulus: 4000.0, poisson_ratio: 0.49}
+  support: [{region: {below_z: 0.001}, type: fixed}]
+  markers: markers.csv
+stereo: {left: left.yaml, right: right.yaml}
+"""
+
+
+def test_the_side_of_markers_on_a_flat_top_is_that_of_the_body(tmp_path):
+    """Places whose y axis runs the wrong way registered the cameras below the body, with level ok."""
+    rig, T, rng = make_test_rig(), looking_down(), np.random.default_rng(3)
+    places = np.array([[x, y, 0.02] for x in np.arange(-0.03, 0.04, 0.02) for y in np.arange(-0.02, 0.03, 0.02)])
+    places[:, :2] += rng.uniform(-0.004, 0.004, (len(places), 2))
+    block = trimesh.creation.box((0.09, 0.08, 0.05))
+    block.apply_translation((0.0, 0.0, -0.005))
+    block.export(tmp_path / "block.stl")
+    write_camera(rig.left, tmp_path / "left.yaml")
+    write_camera(rig.right, tmp_path / "right.yaml")
+    (tmp_path / "experiment.yaml").write_text(FLAT_TOP)
+    pictures = pair(rig, T, places, np.tile([0.0, 0.0, 1.0], (len(places), 1)))
+    for mirrored in (False, True):
+        listed = places * [1.0, -1.0 if mirrored else 1.0, 1.0]
+        lines = [f"{k},{x:.6f},{y:.6f},{z:.6f}" for k, (x, y, z) in enumerate(listed)]
+        (tmp_path / "markers.csv").write_text("\n".join(["id,x,y,z", *lines]) + "\n")
+        tracker = StereoTracker.from_experiment(load_experiment(tmp_path))
+        frame, status = tracker.process(*pictures)
+        if mirrored:
+            assert status.level == "error" and "only as seen from inside the body" in status.message
+            continue
+        assert status.level == "ok" and np.abs(frame.points - places[frame.ids]).max() < 2e-4  # measured 5e-5
+        assert tracker.T_phantom_left is not None and tracker.T_phantom_left[2, 3] > 0.3
 
 
 def test_a_symmetric_pattern_is_refused_with_its_reason():

@@ -2,6 +2,8 @@
 
 numba unpickles and runs what lies in its cache; a file that was damaged there ends the process, or worse. So each file
 ends with a checksum of what is before it (which unpickling does not read), and one that does not is compiled again.
+numba compiles a kernel again when its own file has changed, and does not look at what it takes from other files:
+kernels that it calls, and numbers, which are compiled into it. So those are part of what it is kept for.
 """
 
 from __future__ import annotations
@@ -15,6 +17,7 @@ from typing import Any
 
 import numba
 from numba.core.caching import IndexDataCacheFile
+from numba.core.dispatcher import Dispatcher
 
 MARK = b"crc32"
 
@@ -26,12 +29,27 @@ def _njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
         kernel = numba.njit(nogil=True, **options)(function)
         if options.get("cache"):
             kernel._cache._cache_file.__class__ = _CheckedFiles
+            kernel._cache._cache_file._source_stamp = _stamp(function, kernel._cache._cache_file._source_stamp)
         return kernel
 
     return decorate
 
 
 njit: Any = _njit  # numba types its kernels itself
+
+
+def _stamp(function: Callable[..., Any], own: Any) -> tuple[Any, int]:
+    """Return what a kernel is kept for: the stamp of its ``own`` file, and a checksum of what it takes from others that
+    is known when it is defined (what is defined later is in its own file)."""
+    taken = []
+    for name in sorted(function.__code__.co_names):
+        value = function.__globals__.get(name)
+        if isinstance(value, Dispatcher):
+            cache = getattr(value._cache, "_cache_file", None)
+            taken.append((name, cache._source_stamp if cache is not None else value.py_func.__code__.co_code))
+        elif isinstance(value, bool | int | float | str | tuple):
+            taken.append((name, value))
+    return own, zlib.crc32(repr(taken).encode())
 
 
 class _CheckedFiles(IndexDataCacheFile):

@@ -14,8 +14,10 @@ from livedeform.common.errors import RecordingError
 
 NS = 1_000_000_000
 MOST_SECONDS = 2**31  # a builtin_interfaces/Time has an int32
-APART_NS = 3600 * NS  # a pause that long within one recording is another recording, or a wrong clock
+APART_NS = 3600 * NS  # after so long, what is alone has a wrong stamp, and what are several may have
+PAUSE_NS = 7 * 24 * 3600 * NS  # nobody lets a recording wait for longer than that: before it, no clock was set
 RARE = 0.1  # share of the stamps: what is more than that is no exception
+STRETCH = 3  # so many messages in a row are no single fault of a stamp
 OFFSET_NS = NS  # by which receive time minus stamp may jump, and
 MANY = 10.0  # times as much as it usually changes from one message to the next
 GATE_NS = 60 * NS  # a jump that long, live, waits for the next stamp
@@ -39,19 +41,19 @@ def read_stamp(stamp: Any) -> int:
 def bad_stamps(stamps_ns: Sequence[int], received_ns: Sequence[int]) -> NDArray[np.bool_]:
     """Return which (n,) of a topic's stamps cannot be right, looking back on a whole recording.
 
-    Those beyond a pause of `APART_NS` with few of the stamps, and those whose distance from the receive time jumps by
-    over `OFFSET_NS` from one message to the next and back.
+    Those that are few beyond a gap of `APART_NS`, save for several that a pause explains, and those whose distance
+    from the receive time jumps by over `OFFSET_NS` from one message to the next and back.
     """
     stamps = np.asarray(stamps_ns, np.int64)
     offsets = np.asarray(received_ns, np.int64) - stamps
     bad = np.zeros(len(stamps), bool)
     if len(stamps) < 3:
         return bad
-    order = np.argsort(stamps, kind="stable")
-    cluster = np.empty(len(stamps), int)
-    cluster[order] = np.cumsum(np.diff(stamps[order], prepend=stamps[order[0]]) > APART_NS)
+    cluster = _clusters(stamps, APART_NS)
     sizes = np.bincount(cluster)
-    bad |= (sizes[cluster] <= max(1, RARE * len(stamps))) & (cluster != sizes.argmax())
+    main = int(sizes.argmax())
+    for k in np.flatnonzero(sizes <= max(1, RARE * len(stamps))):
+        bad[cluster == k] = k != main and not _after_a_pause(stamps, offsets, cluster == k, cluster == main)
     kept = np.flatnonzero(~bad)
     if len(kept) >= 3:
         steps = np.diff(offsets[kept])
@@ -60,6 +62,35 @@ def bad_stamps(stamps_ns: Sequence[int], received_ns: Sequence[int]) -> NDArray[
         jumps = (np.minimum(np.abs(there), np.abs(back)) > usual) & (there * np.sign(back) < 0)
         bad[kept[1:-1]] = jumps & (np.abs(there + back) < 0.5 * np.abs(there))
     return bad
+
+
+def long_pauses(stamps_ns: Sequence[int]) -> int:
+    """Return how many pauses of over `APART_NS` there are between stamps."""
+    return int((np.diff(np.sort(np.asarray(stamps_ns, np.int64))) > APART_NS).sum())
+
+
+def in_stretches(bad: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return which (n,) of the ``bad`` (n,) are `STRETCH` or more in a row, in the order in which they came."""
+    run = np.cumsum(np.diff(bad, prepend=False))
+    return np.asarray(bad & (np.bincount(run, minlength=1)[run] >= STRETCH))
+
+
+def _clusters(stamps: NDArray[np.int64], apart_ns: int) -> NDArray[np.int64]:
+    """Return the number (n,) of each stamp's cluster: from one to the next there are more than ``apart_ns``."""
+    order = np.argsort(stamps, kind="stable")
+    out = np.empty(len(stamps), np.int64)
+    out[order] = np.cumsum(np.diff(stamps[order], prepend=stamps[order[0]]) > apart_ns)
+    return out
+
+
+def _after_a_pause(
+    stamps: NDArray[np.int64], offsets: NDArray[np.int64], few: NDArray[np.bool_], most: NDArray[np.bool_]
+) -> bool:
+    """Tell whether a pause lies between the ``few`` and ``most`` (n,) of the stamps: several messages that came as long
+    after their stamps as the others, so that both clocks say it, and no longer away than a recording may wait."""
+    together = _clusters(stamps, PAUSE_NS)
+    alike = abs(float(np.median(offsets[few])) - float(np.median(offsets[most]))) < 0.5 * APART_NS
+    return bool(few.sum() > 1 and alike and together[few][0] == together[most][0])
 
 
 class StampKind(Enum):

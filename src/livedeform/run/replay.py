@@ -9,11 +9,17 @@ from typing import Literal
 
 from livedeform.common import topics as t
 from livedeform.common.bags.read import BagReader
-from livedeform.common.bags.recording import Recording, header_stamp_ns
+from livedeform.common.bags.recording import Recording, Stamps, header_stamp_ns
 from livedeform.common.bags.types import RawMessage, decode
+from livedeform.common.checks.beginning import check_start
+from livedeform.common.checks.finding import Finding
 from livedeform.common.errors import InputError, RecordingError
+from livedeform.common.experiment.plausibility import read_body
 from livedeform.common.experiment.yaml_file import Experiment
 from livedeform.common.stamps import APART_NS, bad_stamps
+from livedeform.fem_node.declared import declared_physics
+from livedeform.fem_node.effects import apply_effects
+from livedeform.fem_node.physics.memory import memory_of
 from livedeform.stereo_node.effects import EFFECTS
 
 Measured = Literal["images", "markers", "surface"]
@@ -183,6 +189,7 @@ def cut(recording: Recording, bag: BagReader, plan: Plan, start: float, duration
         return set().union(*(played.get(topic, set()) for topic in topics))
 
     measured, poses, wrenches = of(t.STEREO_MARKERS, t.STEREO_MARKERS_RAW), of(t.PROBE_POSE), of(t.PROBE_WRENCH)
+    stamps = {name: measured if name == t.STEREO_MARKERS else of(name) for name in recording.arrivals}
     if recording.poses and t.PROBE_POSE in plan.topics and not poses:
         what = f"there is no {t.PROBE_POSE} in the part that is to be played"
         raise InputError(what, where="--start, --duration", remedy="play more of the recording")
@@ -192,8 +199,24 @@ def cut(recording: Recording, bag: BagReader, plan: Plan, start: float, duration
         uncorrected_marker_frames=[f for f in recording.uncorrected_marker_frames if f.stamp_ns in measured],
         poses=[pose for pose in recording.poses if pose.stamp_ns in poses],
         wrenches=[wrench for wrench in recording.wrenches if wrench.stamp_ns in wrenches],
+        arrivals={name: kept for name, came in recording.arrivals.items() if (kept := _kept(came, stamps[name]))},
         picture_stamps_ns=tuple(sorted(of(t.LEFT_IMAGE, t.LEFT_COMPRESSED))),
     )
+
+
+def _kept(came: Stamps, stamps: set[int]) -> Stamps:
+    return [pair for pair in came if pair[0] in stamps]
+
+
+def check_cut(whole: Recording, played: Recording, experiment: Experiment) -> list[Finding]:
+    """Doubt a part of a ``whole`` recording that is ``played`` alone, where it begins within a press, or after what the
+    model would remember."""
+    if not played.poses or played.poses[0].stamp_ns == whole.poses[0].stamp_ns:
+        return []
+    memory = memory_of(apply_effects(declared_physics(experiment), experiment.effects))
+    lasting = [reason for reason in memory.path_dependent if reason not in memory.rubs]
+    start = 1e-9 * (played.poses[0].stamp_ns - whole.start_ns)
+    return check_start(whole, experiment, read_body(experiment), start, lasting, memory.rubs)
 
 
 def messages(bag: BagReader, plan: Plan, start: float = 0.0, duration: float | None = None) -> Iterator[RawMessage]:

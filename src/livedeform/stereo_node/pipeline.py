@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from livedeform.common.errors import CalibrationError, InputError
+from livedeform.common.experiment.plausibility import read_body
 from livedeform.common.experiment.schema import Experiment, Markers
 from livedeform.common.frames import apply, inverse, pose_matrix
 from livedeform.common.types import Array, CameraCalibration, Image, MarkerFrame, Pose
@@ -33,6 +34,7 @@ from livedeform.stereo_node.status import FrameStatus, total_counts
 from livedeform.stereo_node.track.identities import AFTER_A_PAUSE, IdentityTracker, Tracked, TrackSettings
 from livedeform.stereo_node.track.match import MatchSettings, Pairs, candidate_pairs
 from livedeform.stereo_node.track.register import MIN_MARKERS, Registration, refine
+from livedeform.stereo_node.track.sides import nearly_flat, outward_side
 from livedeform.stereo_node.track.start import (
     MarkersAtRest,
     named_as_before,
@@ -98,7 +100,7 @@ class StereoTracker:
 
     ``rest_points`` (m, 3) m: where the markers are at rest in the recording, if that is not where ``markers``
     declares them (an unloaded scan that sags). Without ``T_phantom_left`` the pose is found from the first pictures,
-    in which the body must be at rest.
+    in which the body must be at rest, and of markers in a plane by ``outward`` (3,), its normal out of the body.
     """
 
     def __init__(
@@ -109,13 +111,14 @@ class StereoTracker:
         T_phantom_left: Array | Pose | None = None,
         rest_points: Array | None = None,
         calibration: Bundle | None = None,
+        outward: Array | None = None,
     ) -> None:
         self.rig = rig
         self.settings = settings = settings or TrackerSettings()
         self.ids = np.asarray(markers.ids, np.uint32)
         points = np.asarray(markers.points if rest_points is None else rest_points, float)
         kinds = np.asarray(markers.kinds)
-        self._rest = MarkersAtRest(points, kinds, settings.rest_tolerance, settings.rest_tolerance_most)
+        self._rest = MarkersAtRest(points, kinds, settings.rest_tolerance, settings.rest_tolerance_most, outward)
         if isinstance(T_phantom_left, Pose):
             T_phantom_left = pose_matrix(T_phantom_left)
         self.T_phantom_left: Array | None = T_phantom_left
@@ -148,7 +151,9 @@ class StereoTracker:
             )
         stereo, settings = experiment.stereo, TrackerSettings(detector=detector_of(experiment))
         bundle = None if stereo is None or stereo.left is None else read_bundle(stereo.left, rig)
-        return cls(rig, experiment.markers, settings, declared_camera_pose(experiment), rest_points, bundle)
+        pose = declared_camera_pose(experiment)
+        side = None if pose is not None else _outward(experiment, rest_points)
+        return cls(rig, experiment.markers, settings, pose, rest_points, bundle, side)
 
     def process(self, left: Image, right: Image, model: Array | None = None) -> tuple[MarkerFrame, FrameStatus]:
         """Measure the markers of one pair, in the frame phantom.
@@ -316,7 +321,7 @@ class StereoTracker:
         epipolar = pairs.epipolar_px[measured.pairs]
         n_matched = len(np.unique(pairs.left))
         rms = float(np.sqrt((epipolar**2).mean())) if len(measured) else float("nan")
-        level, message = self._verdict(len(measured), rms, n_matched)
+        level, message = self._verdict(len(measured), rms, n_matched, self._beside_rest(measured))
         if AFTER_A_PAUSE in tracked.rejected:
             what = "markers moved by as much as they are apart while no pictures came"
             level, message = "error", f"{what}; waiting until the body is as before, or at rest"
@@ -338,8 +343,17 @@ class StereoTracker:
             n_by_model=tracked.n_by_model,
         )
 
-    def _verdict(self, n: int, epipolar_rms: float, n_matched: int) -> tuple[str, str]:
-        """Return level and message for ``n`` markers with an epipolar error (px, rms) among ``n_matched`` spots."""
+    def _beside_rest(self, measured: MeasuredMarkers) -> float:
+        """Return how far (m, median) the markers lie from their declared places by a given pose, with which the first
+        pictures begin; 0 later and where the pose was found from them."""
+        if self._proven or not self._given or not len(measured):
+            return 0.0
+        places = apply(self._pose(), measured.points.points)
+        return float(np.median(np.linalg.norm(places - self._rest.points[measured.markers], axis=1)))
+
+    def _verdict(self, n: int, epipolar_rms: float, n_matched: int, beside_rest: float) -> tuple[str, str]:
+        """Return level and message for ``n`` markers with an epipolar error (px, rms) among ``n_matched`` spots, that
+        begin ``beside_rest`` m from their declared places."""
         settings = self.settings
         if n == 0:
             return "error", "no marker was identified; check that the body is in view and T_phantom_left still holds"
@@ -348,6 +362,9 @@ class StereoTracker:
             return "error", f"{what}; the calibration is not of these cameras as they stand"
         if not self._proven and n < min(MIN_SHARE * min(n_matched, len(self.ids)), len(self.ids)):
             what = f"{n} of {n_matched} matched spots are where markers should be"
+            return "error", f"{what}; check the given pose, markers.csv and the calibration"
+        if beside_rest > settings.rest_tolerance_most:
+            what = f"the markers are {beside_rest * 1e3:.1f} mm (median) from where they should be"
             return "error", f"{what}; check the given pose, markers.csv and the calibration"
         said = f"{n} of {len(self.ids)} markers"
         if self.registration is not None and self.registration.rms > 1.5 * settings.rest_tolerance:
@@ -406,6 +423,17 @@ class StereoTracker:
             return status
         rejected = total_counts(*(dict(blobs.rejected or {}) for blobs in spots))
         return replace(status, n_found_left=len(spots.left), n_found_right=len(spots.right), rejected=rejected)
+
+
+def _outward(experiment: Experiment, rest_points: Array | None) -> Array | None:
+    """Return the normal (3,) out of the body of the plane of its markers, as they are declared; None where they do not
+    lie in one at rest, ``rest_points`` (m, 3) m if those are others."""
+    markers = experiment.markers
+    outside = markers.kinds != "internal"
+    at_rest = (markers.points if rest_points is None else rest_points)[outside]
+    if len(at_rest) < MIN_MARKERS or not nearly_flat(at_rest):
+        return None
+    return outward_side(read_body(experiment), markers.points[outside])
 
 
 def _rays_meet(measured: Triangulated) -> NDArray[np.bool_]:

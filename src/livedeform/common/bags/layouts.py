@@ -80,9 +80,21 @@ def pack_surface_points(points: Array, covariances: Array | None) -> NDArray[Any
 def unpack_marker_frame(stamp_ns: int, rows: NDArray[Any]) -> MarkerFrame:
     """Read a frame of ``/stereo/markers``; fields left out by another tracker are NaN, so are impossible covariances.
 
-    ``RecordingError`` without ids: the order of the rows says nothing.
+    Markers of one id that are at two places are left out. ``RecordingError`` without ids: the order of the rows says
+    nothing.
     """
-    return MarkerFrame(stamp_ns, *marker_columns(rows)[0])
+    columns = marker_columns(rows)[0]
+    once = ~named_twice(columns[0], np.asarray(np.isfinite(columns[1]).all(axis=1)))
+    return MarkerFrame(stamp_ns, *(columns if once.all() else (column[once] for column in columns)))
+
+
+def named_twice(marker_ids: Ids, told: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return which (n,) of a frame's rows have an id that another has too, of those that are ``told`` (n,): nobody
+    knows which of them is that marker."""
+    _, row, count = np.unique(marker_ids[told], return_inverse=True, return_counts=True)
+    out = np.zeros(len(marker_ids), bool)
+    out[told] = count[row] > 1
+    return out
 
 
 def marker_columns(rows: NDArray[Any]) -> tuple[tuple[Ids, Array, Array, Array], int]:

@@ -26,7 +26,7 @@ from livedeform.common.bags.types import RawMessage, decode
 from livedeform.common.errors import RecordingError
 from livedeform.common.experiment.schema import Experiment
 from livedeform.common.frames import NO_ROTATION, odd_norms, unit_pose, unit_poses
-from livedeform.common.stamps import bad_stamps, read_stamp, times_set_back
+from livedeform.common.stamps import bad_stamps, in_stretches, long_pauses, read_stamp, times_set_back
 from livedeform.common.types import Array, CameraCalibration, Ids, Image, MarkerFrame, Pose, PredictedMarkers, Wrench
 
 __all__ = ["ErrorFrame", "Recording", "load_poses", "load_recording", "read_images"]
@@ -35,6 +35,8 @@ NS = 1_000_000_000
 BEGINS = "begins_ns"  # in the metadata of a run: when the recording began that was run
 PICTURES = (*t.IMAGES, *t.COMPRESSED_IMAGES)
 MEASURED_TOPICS = (t.STEREO_MARKERS, t.STEREO_SURFACE, t.PROBE_POSE, t.PROBE_WRENCH, *PICTURES)
+FEW = 5  # pictures at the beginning, by whose arrival a clock is told
+SAME_PLACE, SAME_TURN = 1e-4, 1e-3  # m and rad: transforms further apart than that are two
 Stamps = list[tuple[int, int]]  # of one topic: header.stamp and receive time of each message, ns
 HEADED_TYPES = frozenset(
     {t.IMAGE, t.COMPRESSED_IMAGE, t.CAMERA_INFO, t.POINT_CLOUD, t.POSE_STAMPED, t.WRENCH_STAMPED, t.DIAGNOSTICS}
@@ -74,7 +76,8 @@ class Recording:
     (`common.checks.recorded.FAULTS`). ``unknown_ids`` are of markers that the experiment does not have;
     ``picture_stamps_ns`` of the first and last left pictures. ``repeats`` counts by topic the messages whose stamp was
     there already: how many were ``left_out``, and how many ``joined``; ``other_frames`` by topic the frame that it
-    says, where that is not the phantom's.
+    says, where that is not the phantom's; ``arrivals`` by topic of what was measured good stamps and when
+    these messages came (of pictures the first few and those of the last second).
     """
 
     path: Path
@@ -96,6 +99,7 @@ class Recording:
     picture_stamps_ns: tuple[int, ...] = ()
     repeats: Mapping[str, Repeats] = field(default_factory=dict)
     other_frames: Mapping[str, str] = field(default_factory=dict)
+    arrivals: Mapping[str, Stamps] = field(default_factory=dict)
 
     @property
     def own_name(self) -> str:
@@ -143,6 +147,7 @@ def load_recording(path: Path | str, experiment: Experiment | None = None) -> Re
         metadata = dict(bag.metadata)
         pictures = picture_stamps(bag)
         collector.given = not any(name in bag.topics for name in PICTURES)
+        arrivals = arrivals_of(bag, collector.stamps)
     known = None if experiment is None else experiment.markers.ids
     marker_frames = [_keep(f, known, collector) for f in collector.sorted(t.STEREO_MARKERS)]
     uncorrected = [_keep(f, known, collector) for f in collector.sorted(t.STEREO_MARKERS_RAW)]
@@ -166,6 +171,7 @@ def load_recording(path: Path | str, experiment: Experiment | None = None) -> Re
         picture_stamps_ns=pictures,
         repeats=collector.repeats,
         other_frames=collector.other_frames,
+        arrivals=arrivals,
     )
 
 
@@ -218,8 +224,13 @@ def header_stamps(messages: Iterable[RawMessage]) -> Stamps:
 
 def good_stamps(known: Stamps) -> list[int]:
     """Return one topic's header stamps without those that cannot be right (`bad_stamps`)."""
-    stamps, received = [k[0] for k in known], [k[1] for k in known]
-    return [s for s, bad in zip(stamps, bad_stamps(stamps, received), strict=True) if not bad]
+    return [stamp for stamp, _ in good_messages(known)]
+
+
+def good_messages(known: Stamps) -> Stamps:
+    """Return one topic's header stamps with the receive times, without those that cannot be right."""
+    bad = bad_stamps([k[0] for k in known], [k[1] for k in known])
+    return [pair for pair, wrong in zip(known, bad, strict=True) if not wrong]
 
 
 def picture_stamps(bag: BagReader) -> tuple[int, ...]:
@@ -228,12 +239,21 @@ def picture_stamps(bag: BagReader) -> tuple[int, ...]:
     return tuple(good_stamps(header_stamps(ends(bag, name)))) if name is not None else ()
 
 
-def ends(bag: BagReader, topic: str) -> Iterator[RawMessage]:
-    """Return the messages of a topic; of pictures, which are large, just the first and those of the last second."""
+def arrivals_of(bag: BagReader, known: Mapping[str, Stamps]) -> dict[str, Stamps]:
+    """Return by topic the good stamps of what was measured, and when these messages came. Markers that are found in
+    pictures came as late as that took, and tell nothing of a clock; pictures are read at both ends."""
+    filmed = [name for name in PICTURES if name in bag.topics]
+    pairs = {name: header_stamps(ends(bag, name, FEW)) for name in filmed}
+    pairs |= {name: known[name] for name in (t.PROBE_POSE, *(() if filmed else (t.STEREO_MARKERS,)))}
+    return {name: each for name, all_of_it in pairs.items() if (each := good_messages(all_of_it))}
+
+
+def ends(bag: BagReader, topic: str, first: int = 1) -> Iterator[RawMessage]:
+    """Return the messages of a topic; of pictures, which are large, just the ``first`` and those of the last second."""
     if topic not in PICTURES:
         yield from bag.messages([topic])
         return
-    yield from islice(bag.messages([topic]), 1)
+    yield from islice(bag.messages([topic]), first)
     yield from bag.messages([topic], start_ns=bag.end_ns - NS)
 
 
@@ -435,7 +455,10 @@ class _Collector:
         for entry in message.transforms:
             p, q = entry.transform.translation, entry.transform.rotation
             key = (entry.header.frame_id, entry.child_frame_id)
-            self.transforms[key] = unit_pose(_stamp(entry), (p.x, p.y, p.z), (q.x, q.y, q.z, q.w))
+            pose = unit_pose(_stamp(entry), (p.x, p.y, p.z), (q.x, q.y, q.z, q.w))
+            if key == (t.FRAME_PHANTOM, t.FRAME_LEFT):
+                self.faults["cameras_moved"] += not _is_same(self.transforms.get(key, pose), pose)
+            self.transforms[key] = pose
 
     def sorted(self, topic: str) -> list[Any]:
         """Sort by stamp, without those whose stamp cannot be right. Of two with the same stamp the first stays, but
@@ -443,12 +466,15 @@ class _Collector:
         stamps = [item.stamp_ns for item in self.items[topic]]
         bad = self._bad(topic, stamps)
         if bad.any():
+            stretches = int(in_stretches(bad).sum()) if t.TOPICS[topic].input else 0
             self.count(f"{topic}: left out, the stamp cannot be right", int(bad.sum()))
-            self.faults["stamp"] += int(bad.sum())
+            self.faults["stamp"] += int(bad.sum()) - stretches
+            self.faults["stretch"] += stretches
         self.faults["unset"] += len(stamps) > 1 and not any(stamps)
         good = [item for item, wrong in zip(self.items[topic], bad, strict=True) if not wrong]
         if t.TOPICS[topic].input:
             self.faults["set_back"] += times_set_back([item.stamp_ns for item in good])
+            self.faults["pause"] = max(self.faults["pause"], long_pauses([item.stamp_ns for item in good]))
         unique: list[Any] = []
         joined = 0
         for item in sorted(good, key=lambda item: item.stamp_ns):
@@ -489,9 +515,15 @@ def _joined(one: Any, other: Any) -> Any:
     return type(one)(one.stamp_ns, *(np.concatenate(values[k : k + 2]) for k in range(0, len(values), 2)))
 
 
+def _is_same(one: Pose, other: Pose) -> bool:
+    """Tell whether two transforms are one, but for what they are rounded by."""
+    turn = 2.0 * np.arccos(min(abs(float(one.orientation_xyzw @ other.orientation_xyzw)), 1.0))
+    return bool(np.linalg.norm(one.position - other.position) < SAME_PLACE and turn < SAME_TURN)
+
+
 def _keep(frame: MarkerFrame, known: Ids | None, collector: _Collector) -> MarkerFrame:
     """Return the frame without markers that are not finite, not known, or there twice."""
-    keep = np.isfinite(frame.points).all(axis=1)
+    keep = np.asarray(np.isfinite(frame.points).all(axis=1))
     key = frame.ids.tobytes()
     if key in collector.sound_ids and keep.all():
         return frame
@@ -506,11 +538,11 @@ def _keep(frame: MarkerFrame, known: Ids | None, collector: _Collector) -> Marke
                 f"{t.STEREO_MARKERS}: markers left out in some frames, the experiment does not know their ids"
             )
         keep &= ~unknown
-    first = np.zeros(len(frame.ids), bool)
-    first[np.unique(frame.ids, return_index=True)[1]] = True
-    if (keep & ~first).any():
+    twice = layouts.named_twice(frame.ids, keep)
+    if twice.any():
+        collector.faults["twice"] += len(np.unique(frame.ids[twice]))
         collector.count(f"{t.STEREO_MARKERS}: markers left out in some frames, their id is there twice")
-    keep &= first
+    keep &= ~twice
     if keep.all():
         collector.sound_ids.add(key)
         return frame

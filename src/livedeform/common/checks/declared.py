@@ -53,7 +53,12 @@ def _large_errors(experiment: Experiment, body: Surface) -> list[Finding]:
     sigmas = experiment.markers.sigmas[np.isfinite(experiment.markers.sigmas)]
     said = [("thresholds.error", experiment.thresholds.error), ("sigma in markers.csv", float(sigmas.max(initial=0.0)))]
     return [
-        Finding("WARN", f"{name} is {1e3 * error:.3g} mm, of a body of {1e3 * body.diagonal:.3g} mm: {LET}", METRES)
+        Finding(
+            "WARN",
+            f"{name} is {1e3 * error:.3g} mm, of a body of {1e3 * body.diagonal:.3g} mm: {LET}",
+            METRES,
+            doubts=True,
+        )
         for name, error in said
         if error > LARGE * body.diagonal
     ]

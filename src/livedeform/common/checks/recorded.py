@@ -11,10 +11,13 @@ import numpy as np
 
 from livedeform.common import topics as t
 from livedeform.common.bags.recording import Recording, load_recording
+from livedeform.common.checks.beginning import check_beginning
+from livedeform.common.checks.clocks import check_clocks
 from livedeform.common.checks.declared import check_declared
 from livedeform.common.checks.exchanged import check_exchanged
 from livedeform.common.checks.finding import Finding, Severity, refuse_errors
 from livedeform.common.checks.probe_path import check_probe
+from livedeform.common.checks.tared import check_tared
 from livedeform.common.errors import InputError
 from livedeform.common.experiment.plausibility import read_body
 from livedeform.common.experiment.schema import Experiment
@@ -33,7 +36,7 @@ def check_recording(recording: Recording, experiment: Experiment) -> list[Findin
     body = read_body(experiment)
     checks: Sequence[Callable[[Recording, Experiment, Surface], list[Finding]]] = (
         check_faults, check_frames, check_ids, check_inputs, check_stamps, check_gaps, check_places, check_exchanges,
-        check_probe, check_release, check_drifts,
+        check_clocks, check_probe, check_beginning, check_tared, check_release, check_drifts,
     )  # fmt: skip
     found = [finding for check in checks for finding in check(recording, experiment, body)]
     return [*found, *check_declared(experiment, body)]
@@ -78,6 +81,13 @@ FAULTS: dict[str, tuple[Severity, str, str]] = {
     "covariance": ("WARN", "covariances that are negative, infinite or incomplete are taken as unknown",
                    "correct the tracker's covariances"),
     "stamp": ("WARN", "messages whose stamp cannot be right are left out", "check the clocks"),
+    "stretch": ("WARN", "messages whose stamp cannot be right are left out, several in a row",
+                "record again, with clocks that are set before"),
+    "pause": ("NOTE", "pauses of more than an hour: the body is taken to be as old as the stamps say", ""),
+    "twice": ("WARN", "markers whose id is there twice in a frame are left out: nobody knows which is which",
+              "give every marker its own id"),
+    "cameras_moved": ("WARN", f"{t.TF_STATIC} says anew where the cameras are: the last place counts for all",
+                      "record again, with cameras that stay, or part the recording there"),
     "quaternion": ("WARN", "poses whose orientation is no rotation are left out", "check the robot's poses"),
     "not_finite": ("NOTE", "markers whose coordinates are not finite are left out", ""),
     "norm": ("WARN", "poses whose quaternion's norm is not 1 are taken for the rotation that it is a multiple of",
@@ -87,7 +97,7 @@ FAULTS: dict[str, tuple[Severity, str, str]] = {
     "unset": ("ERROR", "every stamp is 0", "set header.stamp when recording"),
 }  # fmt: skip
 """Counted by ``load_recording``: level, what, remedy."""
-DOUBTFUL = {"norm", "set_back"}  # faults that may spoil what is concluded
+DOUBTFUL = {"norm", "set_back", "stretch", "twice", "cameras_moved"}  # faults that may spoil what is concluded
 
 
 def check_faults(recording: Recording, experiment: Experiment, body: Surface) -> list[Finding]:

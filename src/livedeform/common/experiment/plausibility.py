@@ -164,11 +164,10 @@ def _check_lengths(experiment: Experiment, surface: Surface) -> None:
     """Refuse lengths that are millimetres by all likelihood: of what lies in the body, and of what presses on it."""
     across = surface.diagonal
     lengths = [(f"phantom.lesions.{i}.diameter", x.diameter) for i, x in enumerate(experiment.lesions)]
+    lengths += [("thresholds.error", experiment.thresholds.error)]
     sigmas = experiment.markers.sigmas[np.isfinite(experiment.markers.sigmas)]
     if len(sigmas) and sigmas.max() > LARGEST_ERROR * across:
         _refuse_length(str(experiment.phantom.markers), "sigma", float(sigmas.max()), surface)
-    if experiment.thresholds.error > LARGEST_ERROR * across:
-        _refuse_length(_where(experiment, "thresholds.error"), "error", experiment.thresholds.error, surface)
     for key, length in lengths:
         if length > across:
             _refuse_length(_where(experiment, key), key.rpartition(".")[2], length, surface)

@@ -57,8 +57,28 @@ class Board:
                 f"a square of {self.square:g} m is not plausible",
                 where=self.option,
                 remedy=f"give metres (0.025 for 25 mm); it seems to be in {unit}"
-                if self.square > 0
+                if 0 < self.square < np.inf
                 else "give its length in metres",
+            )
+        if self.kind == "charuco":
+            self._check_markers()
+
+    def _check_markers(self) -> None:
+        """Raise ``CalibrationError`` for ChArUco markers that do not fit into their squares, or are of no dictionary of
+        OpenCV's."""
+        if self.marker and not 0 < self.marker < self.square:  # false for NaN
+            in_mm = 0.1 * self.square < 1e-3 * self.marker < self.square
+            unit = "; it seems to be in millimetres" if in_mm else ""
+            raise CalibrationError(
+                f"a marker of {self.marker:g} m does not fit into a square of {self.square:g} m",
+                where="--marker",
+                remedy=f"give the side of a marker in metres, less than the square{unit}",
+            )
+        if not (self.dictionary.startswith("DICT_") and hasattr(cv2.aruco, self.dictionary)):
+            raise CalibrationError(
+                f"unknown dictionary '{self.dictionary}'",
+                where="--dictionary",
+                remedy="name one of OpenCV's, e.g. DICT_4X4_50",
             )
 
     @property
@@ -79,6 +99,15 @@ class Board:
         return [np.rot90(grid, k).ravel() for k in (0, 2, *quarters)]
 
     @property
+    def mirrored(self) -> list[NDArray[np.int64]]:
+        """Return the ways (n,) of counting a checkerboard's or circles' points as seen from behind, as `turns` does
+        from the front; where the colours tell the ends, from the same end."""
+        grid = np.arange(self.columns * self.rows).reshape(self.rows, self.columns)
+        if self.oriented:  # the first cell stays the dark one where the lines that are turned round are even
+            return [(grid[::-1] if self.rows % 2 == 0 else grid[:, ::-1]).ravel()]
+        return [grid[::-1].ravel()[turn] for turn in self.turns]
+
+    @property
     def points(self) -> Array:
         """(n, 3) m, z = 0: all points of the board, row by row."""
         columns, rows = (self.columns - 1, self.rows - 1) if self.kind == "charuco" else (self.columns, self.rows)
@@ -91,12 +120,6 @@ class Board:
 
     def charuco(self) -> Any:
         """Return OpenCV's ChArUco board."""
-        if not hasattr(cv2.aruco, self.dictionary):
-            raise CalibrationError(
-                f"unknown dictionary '{self.dictionary}'",
-                where="--dictionary",
-                remedy="name one of OpenCV's, e.g. DICT_4X4_50",
-            )
         dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, self.dictionary))
         return cv2.aruco.CharucoBoard(
             (self.columns, self.rows), self.square, self.marker or 0.7 * self.square, dictionary
@@ -225,13 +248,15 @@ def _find_circles(picture: Picture, board: Board, size: tuple[int, int]) -> Boar
             found, centres = cv2.findCirclesGrid(shown, size, flags=flags | extra, blobDetector=detector)
             if found:
                 grid = centres.reshape(size[1], size[0], 2).astype(float)
-                return _fit_circles(picture, (_not_mirrored(grid) if board.kind == "circles" else grid).reshape(-1, 2))
+                return _fit_circles(picture, _not_mirrored(grid).reshape(-1, 2))
     return None
 
 
 def _not_mirrored(grid: Array) -> Array:
     """Return places (rows, columns, 2) px in an order that a board seen from its front has: OpenCV counts a grid of
-    circles in either."""
+    circles in either, and every second row of an asymmetric one of an even number before the one above it."""
+    rows = grid.mean(axis=1)
+    grid = grid[np.argsort(rows @ (rows[-2:].mean(axis=0) - rows[:2].mean(axis=0)))]
     along, down = (np.diff(grid, axis=axis).mean(axis=(0, 1)) for axis in (1, 0))
     return grid if along[0] * down[1] > along[1] * down[0] else grid[::-1]
 

@@ -157,11 +157,19 @@ def start_bundle(points: Array, pairs: Sequence[Pair], size: tuple[int, int]) ->
         lenses.append(Lens(np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2]]), coefficients))
         poses.append([(Rotation.from_rotvec(np.ravel(r)), np.ravel(t)) for r, t in zip(rvecs, tvecs, strict=True)])
     between = [(R_r * R_l.inv(), t_r, t_l) for (R_l, t_l), (R_r, t_r) in zip(*poses, strict=True)]
-    turns = np.array([R.as_rotvec() for R, _, _ in between])
+    turn = _median_turn(Rotation.concatenate([R for R, _, _ in between]))
     shifts = np.array([t_r - R.apply(t_l) for R, t_r, t_l in between])
     boards = np.array([np.concatenate([R.as_rotvec(), t]) for R, t in poses[0]])
-    rig = np.concatenate([np.median(turns, axis=0), np.median(shifts, axis=0)])
+    rig = np.concatenate([turn.as_rotvec(), np.median(shifts, axis=0)])
     return Bundle("k1", lenses[0], lenses[1], rig, boards, np.zeros((0, 0)), np.nan, (), np.zeros_like(points))
+
+
+def _median_turn(turns: Rotation) -> Rotation:
+    """Return the median of rotations, as seen from the one that is nearest to the others: rotation vectors jump at half
+    a turn."""
+    apart = [float((one.inv() * turns).magnitude().sum()) for one in turns]
+    middle = turns[int(np.argmin(apart))]
+    return Rotation.from_rotvec(np.median((turns * middle.inv()).as_rotvec(), axis=0)) * middle
 
 
 def board_pose(points: Array, view: BoardView, lens: Lens) -> Array:

@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from livedeform.common.errors import CalibrationError
 from livedeform.common.types import Array
@@ -162,7 +163,8 @@ def _check_sides(bundle: Bundle) -> None:
             where="--left, --right",
             remedy="use pictures of two cameras apart",
         )
-    if bundle.rig_pose[3] > 0 and abs(bundle.rig_pose[3]) > abs(bundle.rig_pose[4]):
+    x, y, _ = -Rotation.from_rotvec(bundle.rig_pose[:3]).inv().apply(bundle.rig_pose[3:])  # of the right camera
+    if x < 0 and abs(x) > abs(y):
         raise CalibrationError(
             "the right camera comes out left of the left one",
             where="--left, --right",

@@ -10,7 +10,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.stats import t as student
 
+from livedeform.common.errors import CalibrationError
+from livedeform.common.frames import apply, fit_rigid, make_a_frame
 from livedeform.common.types import Array
 from livedeform.stereo_node.boards.boards import Board, Pair
 from livedeform.stereo_node.calibrate.bundle import Bundle
@@ -34,20 +37,22 @@ class ScaleCheck:
     sigma_calibration: float = 0.0
 
     @property
-    def total_sigma(self) -> float:
-        """One sigma of both together."""
-        return float(np.hypot(self.sigma, self.sigma_calibration))
+    def margin(self) -> float:
+        """Half of the 95 % interval: Student's for the scatter between few views, with what the calibration leaves
+        open."""
+        n = self.n_views if self.n_views > 1 else self.n_lengths
+        return float(np.hypot(student.ppf(0.975, max(n - 1, 1)) * self.sigma, 1.96 * self.sigma_calibration))
 
     @property
     def agrees(self) -> bool:
         """Return whether 1 lies in the 95 % interval."""
-        return abs(self.scale - 1) < 1.96 * self.total_sigma
+        return abs(self.scale - 1) < self.margin
 
     @property
     def sentence(self) -> str:
         """The result in one sentence for people."""
-        percent, margin = 100 * (self.scale - 1), 196 * self.total_sigma
-        verdict = "agrees with" if self.agrees else "contradicts"
+        percent, margin = 100 * (self.scale - 1), 100 * self.margin
+        verdict = "agrees with" if self.agrees else "contradicts" if np.isfinite(margin) else "does not judge"
         return (
             f"the independent length {verdict} the scale: measured lengths are {percent:+.3f} +- {margin:.3f} % off "
             f"({self.n_lengths} lengths in {self.n_views} views)"
@@ -59,17 +64,19 @@ def check_lengths(measured: Sequence[Array], true: Sequence[Array]) -> ScaleChec
     to its lengths."""
     per_view = np.array([(m @ t) / (t @ t) for m, t in zip(measured, true, strict=True)])
     weights = np.array([t @ t for t in true])
-    scale = float(weights @ per_view / weights.sum())
-    if len(per_view) > 1:
-        sigma = float(
-            np.sqrt(weights**2 @ (per_view - scale) ** 2) / weights.sum() * np.sqrt(len(per_view) / (len(per_view) - 1))
-        )
-    else:  # one view: from the scatter of its lengths, which is too optimistic about what they share
-        m, t = measured[0], true[0]
-        sigma = (
-            float(np.sqrt(((m - scale * t) ** 2).sum() / max(len(t) - 1, 1) / (t @ t))) if len(t) > 1 else float("nan")
-        )
-    return ScaleCheck(scale, sigma, int(sum(len(t) for t in true)), len(per_view))
+    misfit = float(((measured[0] - per_view[0] * true[0]) ** 2).sum())
+    return _pooled(per_view, weights, int(sum(len(t) for t in true)), misfit)
+
+
+def _pooled(per_view: Array, weights: Array, n_lengths: int, misfit: float) -> ScaleCheck:
+    """Return the mean of the scales ``per_view`` (n,) with ``weights`` (n,) m2; ``misfit`` m2: the sum of squares that
+    the first one leaves of its lengths, from which alone one view has its sigma, too small by what they share."""
+    n, scale = len(per_view), float(weights @ per_view / weights.sum())
+    if n > 1:
+        sigma = float(np.sqrt(weights**2 @ (per_view - scale) ** 2 * n / (n - 1)) / weights.sum())
+    else:
+        sigma = float(np.sqrt(misfit / (n_lengths - 1) / weights[0])) if n_lengths > 1 else float("nan")
+    return ScaleCheck(scale, sigma, n_lengths, n)
 
 
 def check_calibration(bundle: Bundle, size: tuple[int, int], pairs: Sequence[Pair], board: Board) -> ScaleCheck:
@@ -87,8 +94,12 @@ def check_calibration(bundle: Bundle, size: tuple[int, int], pairs: Sequence[Pai
 
 
 def check_scale(rig: StereoRig, pairs: Sequence[Pair], board: Board) -> ScaleCheck:
-    """Check the rig on another board: the distances of all its points from their mean, view by view."""
-    measured, true = [], []
+    """Check the rig on another board: how far all its points are from their mean along where they should be, view by
+    view. (Distances in all directions would be too long by what the depths scatter.)
+
+    ``CalibrationError`` where no view shows three points of it to both cameras.
+    """
+    found = []
     for pair in pairs:
         rows = np.intersect1d(pair.left.rows, pair.right.rows)
         left = pair.left.pixels[np.searchsorted(pair.left.rows, rows)]
@@ -96,6 +107,18 @@ def check_scale(rig: StereoRig, pairs: Sequence[Pair], board: Board) -> ScaleChe
         X, P = triangulate(rig, left, right).points, board.points[rows]
         given = np.isfinite(X).all(axis=1)  # a lens need not give every pixel
         X, P = X[given], P[given]
-        measured.append(np.linalg.norm(X - X.mean(axis=0), axis=1))
-        true.append(np.linalg.norm(P - P.mean(axis=0), axis=1))
-    return check_lengths(measured, true)
+        if not make_a_frame(P):
+            continue
+        should = apply(fit_rigid(P, X), P)
+        should, X = should - should.mean(axis=0), X - X.mean(axis=0)
+        weight = float((should**2).sum())
+        scale = float((should * X).sum()) / weight
+        found.append((scale, weight, len(P), float(((X - scale * should) ** 2).sum()) / 3))
+    if not found:
+        raise CalibrationError(
+            f"none of {len(pairs)} views shows three points of the board, not on a line, to both cameras",
+            where="--check-left, --check-right",
+            remedy="take pictures that show most of the board to both",
+        )
+    scales, weights, counts, misfits = zip(*found, strict=True)
+    return _pooled(np.array(scales), np.array(weights), sum(counts), misfits[0])

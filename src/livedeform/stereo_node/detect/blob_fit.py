@@ -31,7 +31,7 @@ from livedeform.stereo_node.detect.blob_model import (
     profile,
     residuals,
 )
-from livedeform.stereo_node.detect.occlusion import MOST_HIDDEN, find_hidden
+from livedeform.stereo_node.detect.occlusion import MOST_HIDDEN, find_cut, find_hidden
 from livedeform.stereo_node.detect.small_linear import copy_part, solve_spd
 
 N_RESULTS = N_PARAMETERS + 8
@@ -73,11 +73,16 @@ def _fit_blobs(picture, start, margin_px, noise_floor, max_iterations, table):
     for b in range(start.shape[0]):
         p = start[b].copy()
         hidden[:] = False
-        for _ in range(3):
+        for _ in range(5):
             status, scale, n, chosen, work = _descend(
                 picture, p, start[b], margin_px, noise_floor, max_iterations, table, hidden, work
             )
-            if status <= 0.0 or find_hidden(picture, p, hidden, noise_floor, sums) == 0:
+            if status <= 0.0:
+                break
+            new = find_hidden(picture, p, hidden, noise_floor, sums)
+            if new == 0:
+                new = find_cut(n, p, chosen, table, work, hidden, 2.0 * noise_floor)
+            if new == 0:
                 break
             if hidden.sum() > MOST_HIDDEN:
                 break

@@ -19,6 +19,7 @@ from livedeform.stereo_node.detect.settings import DetectorSettings
 MARGIN_PX = (
     4.0  # around the outline; with 3 px the background's slope is less sure and the centre 10 % worse, 5 px cost time
 )
+MOST_SKEWED = 0.06  # of the radius: bodies stretch discs less unevenly; of one that is half covered it is 0.07 to 0.2
 
 
 @dataclass(frozen=True)
@@ -110,6 +111,7 @@ def _tests(
         "contrast is not there": size <= 2.0 * np.abs(start[:, 9]) + settings.min_contrast,
         "aspect": axes[:, 0] <= settings.max_aspect * axes[:, 1],
         "shape": excess <= settings.max_misfit * size,
+        "outline cut off": fit[:, 17] <= MOST_SKEWED * radius,
         "rim hidden": fit[:, 14] >= settings.min_rim,
         "blurred away": fit[:, 5] < np.maximum(radius, 1.0),
         "uncertain centre": (fit[:, 10] + fit[:, 12] < 2 * settings.max_sigma**2) & (fit[:, 10] > 0) & (fit[:, 12] > 0),

@@ -78,8 +78,12 @@ def counted_as_left(left: Blobs, right: Blobs, settings: DetectorSettings) -> Bl
 
 
 def codes_alike(codes: Any, settings: DetectorSettings) -> Sequence[Any]:
-    """Return ``codes`` (n,) in every way of counting that looks alike in pictures, as they are first."""
-    return [turn[codes] for turn in _board(settings).turns] if settings.type in BOARDS else [codes]
+    """Return ``codes`` (n,) in every way of counting that looks alike in pictures, as they are first; of a board also
+    as if it was counted from behind, which markers.csv may do."""
+    if settings.type not in BOARDS:
+        return [codes]
+    board = _board(settings)
+    return [turn[codes] for turn in (*board.turns, *board.mirrored)]
 
 
 def _board(settings: DetectorSettings) -> Board:

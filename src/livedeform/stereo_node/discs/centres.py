@@ -26,6 +26,7 @@ Rows = NDArray[np.int64]
 N_STRAINED = 8  # neighbours
 KNOWN_SIGMA = 1e-3  # m: places that are known worse say nothing of strains
 UNEVEN_STRAIN = 3.0  # measured near a probe on rendered pictures: gradients between markers are larger than their means
+TURN_KNOWN = 3  # neighbours: fewer leave a turn open
 SKEWED = 1.0  # displacement of the middle per skewness of the outline, per axis (one-sided stretching: 3 along it)
 FOLDED = 6.0  # the same for discs that may be folded over an edge of the body
 EYE = np.eye(3)
@@ -75,7 +76,8 @@ class DiscCorrection:
                 folded[body] = found.at_edge
             r2 = 0.5 * (axes**2).sum(axis=(1, 2))
             skewed = np.where(folded, FOLDED, SKEWED) * self._skewness(points, left, right)
-            stretched = UNEVEN_STRAIN * r2 / 4 * self._strain_gradient(markers, places, sigma)
+            gradient = self._strain_gradient(markers, places, sigma) if self.painted else 0.0  # stiff ones do not
+            stretched = UNEVEN_STRAIN * r2 / 4 * gradient
             unsure += np.where(body, stretched**2 + skewed**2, 0.0)[:, None, None] * EYE
         bias_left, bias_right = rim_bias(self.rig, points.points, axes, n, K)
         flat = self.flat[markers][:, None]
@@ -112,11 +114,16 @@ class DiscCorrection:
         return out
 
     def _strain_gradient(self, markers: Rows, places: Array, sigma: Array) -> Array:
-        """Return (n,) 1/m: how differently the neighbours have moved, over the squares of their distances (rms)."""
-        moved = places - self.rest
+        """Return (n,) 1/m: how differently the neighbours have moved, over the squares of their distances (rms).
+
+        How they turned with the body is no strain, and taken off where three or more are known.
+        """
         near, d = self._near[markers], self._distance[markers]
         known = np.isfinite(d) & (sigma[near] < KNOWN_SIGMA)
-        gradient = np.linalg.norm(moved[near] - moved[markers][:, None], axis=2) / np.where(known, d, 1.0) ** 2
+        rest, now = (np.where(known[:, :, None], at[near] - at[markers][:, None], 0.0) for at in (self.rest, places))
+        turned = np.where((known.sum(axis=1) >= TURN_KNOWN)[:, None, None], _turns(rest, now), EYE)
+        apart = now - np.einsum("nij,nkj->nki", turned, rest)
+        gradient = np.linalg.norm(apart, axis=2) / np.where(known, d, 1.0) ** 2
         out: Array = np.sqrt((np.where(known, gradient, 0.0) ** 2).sum(axis=1) / np.maximum(known.sum(axis=1), 1))
         return out
 
@@ -137,3 +144,10 @@ class DiscCorrection:
         length = np.linalg.norm(discs, axis=1)[:, None]
         self.normals[m] = np.where(np.isfinite(discs) & (length > 0), discs / length, self.normals[m])
         self._seen[m] = True
+
+
+def _turns(source: Array, target: Array) -> Array:
+    """Return the rotations (n, 3, 3) that take the offsets ``source`` (n, k, 3) nearest to ``target`` (Kabsch 1976)."""
+    U, _, Vt = np.linalg.svd(np.swapaxes(target, 1, 2) @ source)
+    U[:, :, 2] *= np.linalg.det(U @ Vt)[:, None]
+    return np.asarray(U @ Vt)

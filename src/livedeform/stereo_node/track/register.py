@@ -29,6 +29,7 @@ from livedeform.common.frames import (
 )
 from livedeform.common.types import Array
 from livedeform.stereo_node.track.match import assign
+from livedeform.stereo_node.track.sides import sees_outside
 
 Rows = NDArray[np.int64]
 Solution = tuple[float, Array, Rows, Rows]
@@ -42,6 +43,18 @@ MAX_TRIPLES = 40  # of one measured triangle
 
 class RegistrationError(InputError):
     """The cameras' pose could not be found from the markers, or not uniquely."""
+
+
+class SeenFromInside(RegistrationError):
+    """Markers in a plane fit their places only mirrored, whatever the tolerance."""
+
+    def __init__(self) -> None:
+        super().__init__(
+            "the markers lie in a plane, and fit their places only as seen from inside the body",
+            where="stereo.pose",
+            remedy="an axis of markers.csv runs the wrong way, or its numbers do: as seen from outside, x, y and the "
+            "plane's normal towards the cameras must be right-handed",
+        )
 
 
 @dataclass(frozen=True)
@@ -60,14 +73,16 @@ class Registration:
 
 
 def register(
-    points: Array, covariances: Array, markers: Array, tolerance: float, *, seed: int = 0, groups: Rows | None = None
-) -> Registration:
+    points: Array, covariances: Array, markers: Array, tolerance: float, *, seed: int = 0, groups: Rows | None = None,
+    outward: Array | None = None,
+) -> Registration:  # fmt: skip
     """Register ``points`` (n, 3) m in the left frame, with ``covariances`` (n, 3, 3), to ``markers`` (m, 3) m in
     phantom.
 
     Some points may be false and some markers unseen. ``tolerance`` m is how far markers may lie from where they are
     declared, besides the measuring noise. ``groups`` (n, 2): rows of left and right blobs, where of several points that
-    share one only one can be true. ``RegistrationError`` where no pose fits, or more than one does.
+    share one only one can be true. ``outward`` (3,): from which side the cameras see markers in a plane.
+    ``RegistrationError`` where no pose fits, or more than one does.
     """
     if len(points) < MIN_MARKERS or len(markers) < MIN_MARKERS:
         raise RegistrationError(
@@ -88,6 +103,8 @@ def register(
         )
     found = [_refine(points, covariances, markers, T, tolerance, groups) for T in hypotheses]
     refined = sorted((r for r in found if r is not None), key=lambda r: r[0])
+    if outward is not None and refined:
+        refined = _from_outside(refined, markers, outward)
     runner_up = _check_unique(refined, points, markers, sigma)
     _, T, rows, cols = refined[0]
     residual = markers[cols] - apply(T, points[rows])
@@ -95,6 +112,16 @@ def register(
         T, _pose_covariance(points[rows], covariances[rows], T, residual), rows, cols,
         float(np.sqrt((residual**2).sum(axis=1).mean())), runner_up,
     )  # fmt: skip
+
+
+def _from_outside(refined: list[Solution], markers: Array, outward: Array) -> list[Solution]:
+    """Return those by which the cameras see markers in a plane from ``outward`` (3,); ``RegistrationError`` where the
+    others explain more: the list of the places is mirrored."""
+    outside = [r for r in refined if sees_outside(r[1], markers, outward)]
+    n, most = max((len(r[2]) for r in outside), default=0), len(refined[0][2])
+    if n < most - max(1, AMBIGUITY * most):
+        raise SeenFromInside
+    return outside
 
 
 def _check_unique(refined: list[Solution], points: Array, markers: Array, sigma: Array) -> int:
@@ -154,10 +181,12 @@ def register_named(
 
 
 def register_either_way(
-    points: Array, covariances: Array, markers: Array, ways: Sequence[Rows], tolerance: float
-) -> Registration:
+    points: Array, covariances: Array, markers: Array, ways: Sequence[Rows], tolerance: float,
+    outward: Array | None = None,
+) -> Registration:  # fmt: skip
     """Register ``points`` (n, 3) that pictures name in ``ways`` that look alike: each gives the rows (n,) of the
-    ``markers`` (m, 3), -1 for none. ``RegistrationError`` where none fits, or more than one does."""
+    ``markers`` (m, 3), -1 for none. ``outward`` (3,): from which side the cameras see markers in a plane.
+    ``RegistrationError`` where none fits, or more than one does."""
     found, failed = [], None
     for names in ways:
         known = np.flatnonzero(names >= 0)
@@ -169,6 +198,10 @@ def register_either_way(
             failed = failed or error
     if failed is not None and not found:
         raise failed
+    if outward is not None:
+        found = [f for f in found if sees_outside(f.T_phantom_left, markers, outward)]
+        if not found:
+            raise SeenFromInside
     found.sort(key=lambda f: f.rms)
     sigma = float(np.median(np.sqrt(np.linalg.eigvalsh(covariances)[:, -1])))
     if len(found) > 1 and found[1].rms < RIVAL * max(found[0].rms, sigma):

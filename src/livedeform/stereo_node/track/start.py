@@ -16,9 +16,11 @@ from livedeform.stereo_node.track.register import (
     MIN_MARKERS,
     Registration,
     RegistrationError,
+    SeenFromInside,
     register,
     register_either_way,
 )
+from livedeform.stereo_node.track.sides import nearly_flat
 
 Rows = NDArray[np.int64]
 INTERNAL_SIGMA = 3e-3  # m: refraction lifts a marker 10 mm below the surface by that
@@ -30,18 +32,34 @@ class MarkersAtRest:
     """The declared places of the markers at rest: ``points`` (m, 3) m in phantom, and ``kinds`` (m,).
 
     ``tolerance`` m is how far they may lie from there, ``tolerance_most`` m what is tried when that does not do.
+    ``outward`` (3,): where they lie in a plane, its normal out of the body, if that is known.
     """
 
     points: Array
     kinds: NDArray[np.str_]
     tolerance: float
     tolerance_most: float
+    outward: Array | None = None
 
     @property
     def outside(self) -> NDArray[np.int64]:
         """Rows of the markers that the cameras are registered to: internal ones are seen where refraction puts them."""
         rows = np.flatnonzero(self.kinds != "internal")
         return rows if len(rows) >= MIN_MARKERS else np.arange(len(self.kinds))
+
+    def side(self) -> Array | None:
+        """Return the normal (3,) of the side that the cameras see, None where the markers do not lie in a plane;
+        ``RegistrationError`` where they do and the side is not known."""
+        if not nearly_flat(self.points[self.outside]):
+            return None
+        if self.outward is None:
+            raise RegistrationError(
+                "the markers lie in a plane, and which side of it is out of the body is not known: mirrored places "
+                "would fit as well",
+                where="stereo.pose",
+                remedy="give the pose, or put the markers on the body's surface",
+            )
+        return self.outward
 
     def sigma(self, sigma: float) -> Array:
         """Return how far (m,) m markers may be from where they are declared when they are first seen."""
@@ -59,16 +77,20 @@ def register_cameras(pairs: Pairs, codes: Sequence[Rows] | None, rest: MarkersAt
             where="stereo calibration",
             remedy="check that left and right are not exchanged and that the calibration is of these cameras",
         )
-    points, outside = pairs.points, rest.outside
+    points, outside, side = pairs.points, rest.outside, rest.side()
     if codes is not None:
         named = [np.where(np.isin(names, outside), names, -1) for names in codes]
-        return register_either_way(points.points, points.covariances, rest.points, named, rest.tolerance_most)
+        return register_either_way(points.points, points.covariances, rest.points, named, rest.tolerance_most, side)
     groups = np.stack([pairs.left, pairs.right], axis=1)
     tolerance = rest.tolerance
     while True:
         try:
-            found = register(points.points, points.covariances, rest.points[outside], tolerance, groups=groups)
+            found = register(
+                points.points, points.covariances, rest.points[outside], tolerance, groups=groups, outward=side
+            )
             return replace(found, marker_rows=outside[found.marker_rows])
+        except SeenFromInside:
+            raise
         except RegistrationError:
             tolerance *= WIDER
             if tolerance > rest.tolerance_most:
