@@ -76,6 +76,14 @@ def test_frames_that_hardly_show_the_body_do_not_count(hidden: range, level: str
     assert not len(hidden) or f"{len(hidden)}: fewer than half of the markers were seen" in judged.sentence
 
 
+@pytest.mark.parametrize(("bound", "level"), [(np.nan, "OK"), (0.0, "OK"), (0.002, "OK"), (0.003, "WARN")])
+def test_a_verdict_that_interpolation_may_have_made_is_doubted(bound: float, level: str):
+    """The threshold is 5 mm: predictions so far apart that frames between them may be off by more than half of that."""
+    judged = judge(replace(metrics(EVERY), interpolation_bound=bound))
+    assert judged.level == level
+    assert ("interpolation between predictions may be wrong by up to 3.00 mm" in judged.sentence) == (level == "WARN")
+
+
 def test_both_presses_are_counted():
     coverage = metrics([k for k in EVERY if k < 50]).coverage
     assert coverage is not None

@@ -92,6 +92,22 @@ def test_the_calibration_of_another_camera_gives_no_point(filmed: Filmed, tmp_pa
     assert not any(counts) and len(stereo) == 6 and all(level == 2 for level, _ in stereo)
 
 
+def test_a_calibration_that_does_not_fit_the_body_is_a_doubt(filmed: Filmed, tmp_path: Path):
+    """A baseline that is too long: every status warned of it, and the run was OK without a word."""
+    folder, out = tmp_path / "experiment", tmp_path / "out"
+    shutil.copytree(filmed.folder, folder, ignore=shutil.ignore_patterns("*.mcap"))
+    wide = make_test_rig(width=640, height=480, focal=700.0, baseline=1.11 * 0.06, converge=0.15)
+    write_camera(wide.left, folder / "left.yaml")
+    write_camera(wide.right, folder / "right.yaml")
+    _, stereo, _ = replayed(folder, filmed.bag, out)
+    assert all(level == 1 and "check scale, configuration and calibration" in text for level, text in stereo)
+    document = json.loads((out / "metrics.json").read_text())
+    assert document["verdict"] in ("WARN", "ERROR") and list(document["counts"]["stereo"]["reasons"].values()) == [6]
+    said = f"stereo_node says of 6 of 6 frames: {stereo[-1][1]}"
+    assert said in document["doubts"] and said in document["reason"]
+    assert stereo[-1][1] in (out / "report.html").read_text()
+
+
 def write(path: Path, poses: Sequence[Pose], pairs: Sequence[tuple[Image, Image | None]]) -> Path:
     """A bag of pairs of which some right pictures are missing."""
     with BagWriter(path, {"made_by": "tests"}) as bag:

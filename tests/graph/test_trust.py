@@ -263,6 +263,29 @@ def test_the_topic_ends_with_the_level_of_the_run(
     assert float(values["max"]) == pytest.approx(metrics.max, rel=1e-6)
 
 
+@pytest.mark.parametrize(("case", "doubted", "said"), [
+    ("sound", set(), ""),
+    ("a frame with one marker", {6}, "fewer than half of the markers were seen"),
+    ("no poses for most frames", {8, 9, 10, 11}, "measured frames were compared so far"),
+])  # fmt: skip
+def test_a_frame_is_not_ok_by_itself(
+    case: str, doubted: set[int], said: str, experiment: Path, direct: list[Prediction], tmp_path: Path
+):
+    """Who watches a session sees OK of what says next to nothing: one of 11 markers, one of 9 frames."""
+    frames, poses = measured(direct), small.press()
+    if case == "a frame with one marker":
+        frames[6] = small.frame(frames[6].stamp_ns, frames[6].ids[:1], frames[6].points[:1])
+    if case == "no poses for most frames":
+        poses = poses[8:]
+    run(RunOptions(experiment, small.write_bag(tmp_path / "x.mcap", poses, frames), tmp_path / "out"), lambda *_: None)
+    with read_bag(tmp_path / "out" / "run.mcap") as recorded:
+        statuses = [decode(raw).status[0] for raw in recorded.messages([t.COMPARE_METRICS])][:-1]
+    row = {str(frame.stamp_ns): k for k, frame in enumerate(frames)}
+    found = {row[pair.value]: status.message for status in statuses if status.level
+             for pair in status.values if pair.key == "stamp_ns"}  # fmt: skip
+    assert set(found) == doubted and all(said in text for text in found.values())
+
+
 def test_a_message_that_a_gate_refuses_is_counted(experiment: Path, direct: list[Prediction], tmp_path: Path):
     """Live, nobody has seen the recording before: a stamp days ahead costs its frame, and is a reason."""
     frames = measured(direct)

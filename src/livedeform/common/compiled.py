@@ -45,7 +45,7 @@ def _stamp(function: Callable[..., Any], own: Any) -> tuple[Any, int]:
     for name in sorted(function.__code__.co_names):
         value = function.__globals__.get(name)
         if isinstance(value, Dispatcher):
-            cache = getattr(value._cache, "_cache_file", None)
+            cache = getattr(getattr(value, "_cache", None), "_cache_file", None)
             taken.append((name, cache._source_stamp if cache is not None else value.py_func.__code__.co_code))
         elif isinstance(value, bool | int | float | str | tuple):
             taken.append((name, value))

@@ -1,12 +1,7 @@
 """Associate predictions with measurements: by marker id and stamp, predictions interpolated to that stamp.
 
-Between two predictions at t0 <= t <= t1 a marker moves on the straight line
-
-    x(t) = x0 + a (x1 - x0),   a = (t - t0) / (t1 - t0),
-
-whose remainder is at most |x''| (t - t0)(t1 - t) / 2 (Newton's interpolation formula); x'' is taken from the second
-divided difference with the prediction before t0. Nothing is extrapolated, nothing is bridged over more than
-``max_gap_ns``, and a prediction that did not converge matches nothing: each refusal is counted.
+Nothing is extrapolated, nothing is bridged over more than ``max_gap_ns``, a prediction that did not converge matches
+nothing, and of markers with one id in a frame none is known: each refusal is counted.
 """
 
 from __future__ import annotations
@@ -16,9 +11,11 @@ from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from livedeform.common.stamps import StampClock, StampKind
-from livedeform.common.types import Array, Ids, MarkerFrame, PredictedMarkers
+from livedeform.common.types import Ids, MarkerFrame, PredictedMarkers
+from livedeform.compare_node.interpolation import InterpolationBound, interpolate, remainder
 from livedeform.compare_node.residual import Residual
 
 __all__ = ["Associator", "Counts", "interpolate", "remainder"]
@@ -40,6 +37,7 @@ class Counts:
     frames_without_common_marker: int = 0
     dropped_waiting: int = 0
     matched_markers: int = 0
+    measured_twice: int = 0
     measured_without_prediction: int = 0
     predicted_without_measurement: int = 0
     unknown_ids: set[int] = field(default_factory=set)
@@ -77,6 +75,7 @@ class Associator:
     def __init__(self, max_gap_ns: int = 500_000_000, capacity: int = 100_000) -> None:
         self.max_gap_ns, self.capacity = max_gap_ns, capacity
         self.counts = Counts()
+        self.interpolation_bound = InterpolationBound()
         self._waiting: deque[MarkerFrame] = deque()
         self._predictions: deque[PredictedMarkers] = deque()
         self._measured_clock, self._predicted_clock = StampClock(max_gap_ns), StampClock(max_gap_ns)
@@ -117,6 +116,7 @@ class Associator:
             self._count_out_of_order(1)
             return []
         self._predictions.append(prediction)
+        self.interpolation_bound.settle(prediction)
         return self._drain()
 
     def _count_out_of_order(self, n_predictions: int) -> None:
@@ -131,10 +131,17 @@ class Associator:
         if predictions:
             self._count_out_of_order(len(self._predictions))
             self._predictions.clear()
+            self.interpolation_bound.settle(None)
+
+    @property
+    def n_decided(self) -> int:
+        """Count the measured frames that were compared or refused: the others wait for a prediction."""
+        return self.counts.measured_frames - len(self._waiting)
 
     def flush(self) -> list[Residual]:
         """End the streams: what still waits lies after the last prediction and would be extrapolated."""
         residuals = self._drain(ended=True)
+        self.interpolation_bound.settle(None)
         self.counts.refused_extrapolation += len(self._waiting)
         self._waiting.clear()
         self.refresh_ids()
@@ -154,7 +161,7 @@ class Associator:
             if not ended and not self._predicted_clock.sure_of(self._waiting[0].stamp_ns):
                 break
             frame = self._waiting.popleft()
-            # keep one prediction before the bracket: the curvature needs it
+            # keep one prediction before the bracket: what interpolation can get wrong is told from it
             while len(self._predictions) > 2 and self._predictions[2].stamp_ns < frame.stamp_ns:
                 self._predictions.popleft()
             residual = self._match(frame)
@@ -183,14 +190,19 @@ class Associator:
             self.counts.refused_not_converged += 1
             return None
         before = self._predictions[after - 2] if after >= 2 else None
+        following = self._predictions[after + 1] if after + 1 < len(self._predictions) else None
+        self.interpolation_bound.add((before, first, second), following, frame.stamp_ns)
         prediction = interpolate(first, second, frame.stamp_ns)
         return self._residual(frame, prediction, remainder(before, first, second, frame.stamp_ns))
 
     def _residual(self, frame: MarkerFrame, prediction: PredictedMarkers, bound: float) -> Residual | None:
-        ids, rows, columns = np.intersect1d(frame.ids, prediction.ids, return_indices=True)
+        once = _once(frame.ids)
+        ids, rows, columns = np.intersect1d(frame.ids[once], prediction.ids, return_indices=True)
+        rows = once[rows]
         usable = np.isfinite(frame.points[rows]).all(axis=1) & np.isfinite(prediction.points[columns]).all(axis=1)
         ids, rows, columns = ids[usable].astype(np.uint32), rows[usable], columns[usable]
         measured, predicted = frame.points[rows], prediction.points[columns]
+        self.counts.measured_twice += len(frame.ids) - len(once)
         if len(ids) == 0:
             self.counts.frames_without_common_marker += 1
             return None
@@ -201,30 +213,7 @@ class Associator:
         return Residual(frame.stamp_ns, ids, measured, predicted, frame.covariances[rows], bound)
 
 
-def interpolate(first: PredictedMarkers, second: PredictedMarkers, stamp_ns: int) -> PredictedMarkers:
-    """Return the markers of both predictions on the straight line between them at ``stamp_ns``."""
-    ids, rows, columns = np.intersect1d(first.ids, second.ids, return_indices=True)
-    a = (stamp_ns - first.stamp_ns) / (second.stamp_ns - first.stamp_ns)
-    x0, x1 = first.points[rows], second.points[columns]
-    return PredictedMarkers(stamp_ns, ids.astype(np.uint32), x0 + a * (x1 - x0))
-
-
-def remainder(
-    before: PredictedMarkers | None, first: PredictedMarkers, second: PredictedMarkers, stamp_ns: int
-) -> float:
-    """Return the largest |x''| (t - t0)(t1 - t) / 2 over the markers (m); NaN without one before t0."""
-    if before is None or not before.converged:
-        return float("nan")
-    ids = np.intersect1d(np.intersect1d(before.ids, first.ids), second.ids)
-    if len(ids) == 0:
-        return float("nan")
-    x = [_rows(p, ids) for p in (before, first, second)]
-    t = [(p.stamp_ns - first.stamp_ns) * 1e-9 for p in (before, first, second)]
-    s = (stamp_ns - first.stamp_ns) * 1e-9
-    second_difference = ((x[2] - x[1]) / (t[2] - t[1]) - (x[1] - x[0]) / (t[1] - t[0])) / (t[2] - t[0])
-    return float(np.nanmax(np.linalg.norm(second_difference, axis=1)) * s * (t[2] - s))
-
-
-def _rows(prediction: PredictedMarkers, ids: Ids) -> Array:
-    order = np.argsort(prediction.ids)
-    return prediction.points[order[np.searchsorted(prediction.ids, ids, sorter=order)]]
+def _once(ids: Ids) -> NDArray[np.int64]:
+    """Return the rows of ``ids`` (n,) that are there once: of two markers with one id nobody knows which is which."""
+    _, rows, times = np.unique(ids, return_index=True, return_counts=True)
+    return np.asarray(rows[times == 1], np.int64)

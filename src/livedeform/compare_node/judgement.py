@@ -11,6 +11,7 @@ from livedeform.compare_node.metrics import Level, RunMetrics
 from livedeform.compare_node.surface_error import SurfaceError
 
 ENOUGH, HALF = 0.9, 0.5  # of the measured frames, and of the deepest moments: below it WARN at best, and STALE
+MATTERS = 0.5  # of the threshold, by which interpolation can have been wrong: what is over it may be within, or not
 SMALL = 0.0095  # mm, below which two decimals are 0.01 or 0.00
 REFUSED = {
     "extrapolation": "before the first or after the last prediction",
@@ -77,6 +78,15 @@ def level_of(errors: Level, n_compared: int, n_measured: int) -> Level:
     return Level.WARN if errors is Level.OK and n_compared < ENOUGH * n_measured else errors
 
 
+def doubts_so_far(n_markers: int, most_markers: int, n_compared: int, n_decided: int) -> list[str]:
+    """Return what keeps the level of one frame from being OK while a session goes on: it has ``n_markers`` where
+    another had ``most_markers``, and so many of the frames that were ``n_decided`` up to it were compared."""
+    out = [REFUSED[FEW]] if n_markers < HALF * most_markers else []
+    if n_compared < HALF * n_decided:
+        out.append(f"only {n_compared} of {n_decided} measured frames were compared so far")
+    return out
+
+
 def _of_surface(metrics: RunMetrics, surface: SurfaceError, limit: str) -> Judgement:
     """Judge by points without ids alone. They can show that a model is wrong; that it is right they cannot, since they
     do not see what slides along the surface."""
@@ -108,6 +118,11 @@ def _doubts(metrics: RunMetrics) -> list[str]:
     """Return what keeps the verdict from being OK."""
     c = metrics.coverage
     out = list(metrics.doubts)
+    if metrics.interpolation_bound > MATTERS * metrics.threshold:
+        out.append(
+            f"interpolation between predictions may be wrong by up to {_mm(metrics.interpolation_bound)} mm: record "
+            "the poses more often"
+        )
     if c is None:
         return out
     if c.interrupted:

@@ -204,15 +204,16 @@ def verdict(rmse_m: float, p95_m: float, threshold: float) -> Level:
 
 
 class RunningTotal:
-    """The errors of all frames so far, without keeping them: ``n``, ``rmse`` and ``max`` (m), and the verdict."""
+    """The errors of all frames so far, without keeping them: ``n``, ``rmse`` and ``max`` (m), the verdict, and the
+    ``most`` markers that a frame had."""
 
     def __init__(self, threshold: float) -> None:
-        self.n, self.max = 0, float("nan")
+        self.n, self.most, self.max = 0, 0, float("nan")
         self._threshold, self._n_over, self._sum, self._squares = threshold, 0, 0.0, 0.0
 
     def add(self, distances: Array) -> None:
         """Add the errors (n,) m of one frame."""
-        self.n += len(distances)
+        self.n, self.most = self.n + len(distances), max(self.most, len(distances))
         self._n_over += int((distances > self._threshold).sum())
         self._sum, self._squares = self._sum + float(distances.sum()), self._squares + float(distances @ distances)
         self.max = float(np.fmax(self.max, distances.max(initial=0.0)))

@@ -7,7 +7,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
-import numpy as np
 from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import Float64
 
@@ -18,8 +17,8 @@ from livedeform.common.ros import messages as m
 from livedeform.common.ros.node import CountingNode, run
 from livedeform.common.ros.session import RELIABLE, SENSOR, declare
 from livedeform.compare_node.associate import Associator
-from livedeform.compare_node.judgement import level_of
-from livedeform.compare_node.metrics import RunningTotal, frame_metrics
+from livedeform.compare_node.judgement import doubts_so_far, level_of
+from livedeform.compare_node.metrics import Level, RunningTotal, frame_metrics
 from livedeform.compare_node.residual import Residual
 
 
@@ -54,7 +53,6 @@ class CompareNode(CountingNode):
             )
         }  # fmt: skip
         self._last_stamp_ns, self._fresh, self._total = 0, False, RunningTotal(self.threshold)
-        self.interpolation_bound = float("nan")  # m, the largest so far
         quality = SENSOR if settings.best_effort else RELIABLE
         self.subscribe(PointCloud2, t.STEREO_MARKERS, self.on_measured, quality, gate=True)
         self.subscribe(PointCloud2, t.FEM_MARKERS, self.on_predicted, gate=True)
@@ -72,7 +70,6 @@ class CompareNode(CountingNode):
     def publish(self, residual: Residual) -> None:
         """Publish the error of one frame, its numbers, and how it compares with the threshold."""
         self._errors(m.to_compare_cloud(residual.stamp_ns, residual.ids, residual.measured, residual.errors))
-        self.interpolation_bound = float(np.fmax(self.interpolation_bound, residual.interpolation_bound))
         metrics = frame_metrics(residual, self.threshold)
         self._total.add(residual.distances)
         for name, publish in self._numbers.items():
@@ -80,8 +77,11 @@ class CompareNode(CountingNode):
         values = asdict(metrics) | {"threshold": self.threshold, "interpolation_bound": residual.interpolation_bound}
         del values["stamp_ns"], values["level"]
         self._last_stamp_ns, self._fresh = residual.stamp_ns, True
-        text = f"rmse {metrics.rmse * 1e3:.3f} mm of {metrics.n} markers"
-        self.metrics(residual.stamp_ns, metrics.level, text, values)
+        n_compared = self.associator.counts.matched_frames
+        doubts = doubts_so_far(metrics.n, self._total.most, n_compared, self.associator.n_decided)
+        level = Level.WARN if doubts and metrics.level is Level.OK else metrics.level
+        text = "; ".join([f"rmse {metrics.rmse * 1e3:.3f} mm of {metrics.n} markers", *doubts])
+        self.metrics(residual.stamp_ns, level, text, values)
 
     def metrics(self, stamp_ns: int, level: str, text: str, values: Mapping[str, Any]) -> None:
         """Publish on ``/compare/metrics`` the numbers, the verdict, and what could not be compared so far."""

@@ -16,8 +16,9 @@ class Residual:
     """Markers that were both measured and predicted at one measured stamp.
 
     ``measured`` and ``predicted`` (n, 3) m for ``ids`` (n,), ascending; ``covariances`` (n, 3, 3) m2 of the
-    measurement, NaN where the tracker gives none. ``interpolation_bound`` (m) bounds what the linear interpolation of
-    the predictions in time adds to any marker; NaN where there were too few predictions to say.
+    measurement, NaN where the tracker gives none. ``interpolation_bound`` (m) is what the linear interpolation of the
+    predictions in time adds to any marker, as far as those up to then show (`interpolation.remainder`); NaN where there
+    were too few to say.
     """
 
     stamp_ns: int

@@ -90,7 +90,6 @@ class Simulator:
         self.elsewhere: dict[Key, SolvedMoment] = {}  # what another mesh has solved
         self._markers = EmbeddedPoints(self.space, markers, still)
         self._shapes = UnloadedShapes(self.space)
-        self._corners = np.searchsorted(np.unique(self.space.facets), self.space.facets[:, :3])
 
     def simulate(
         self,
@@ -156,10 +155,6 @@ class Simulator:
         """Start the moments at which the declared body of these ``physics`` was pressed from what the ``other`` mesh
         has solved of it."""
         self.elsewhere = transferred(other.solved.of(frozenset()), other.space, self.space, physics)
-
-    def corner_triangles(self) -> NDArray[np.int64]:
-        """Return the boundary triangles (k, 3) between the elements' corners, as rows of ``Prediction.surface``."""
-        return self._corners
 
     def _model(self, physics: Physics, settings: SolverSettings = SETTINGS) -> PhantomModel:
         settings = IN_MOTION if memory_of(physics).rings else settings

@@ -11,7 +11,7 @@ from livedeform.common import topics as t
 from livedeform.common.bags.read import BagReader
 from livedeform.common.bags.recording import Recording, Stamps, header_stamp_ns
 from livedeform.common.bags.types import RawMessage, decode
-from livedeform.common.checks.beginning import check_start
+from livedeform.common.checks.beginning import begins_inside, check_start
 from livedeform.common.checks.finding import Finding
 from livedeform.common.errors import InputError, RecordingError
 from livedeform.common.experiment.plausibility import read_body
@@ -216,7 +216,9 @@ def check_cut(whole: Recording, played: Recording, experiment: Experiment) -> li
     memory = memory_of(apply_effects(declared_physics(experiment), experiment.effects))
     lasting = [reason for reason in memory.path_dependent if reason not in memory.rubs]
     start = 1e-9 * (played.poses[0].stamp_ns - whole.start_ns)
-    return check_start(whole, experiment, read_body(experiment), start, lasting, memory.rubs)
+    body = read_body(experiment)
+    said = begins_inside(played, experiment, body)
+    return check_start(whole, experiment, body, start, lasting, memory.rubs, said=said)
 
 
 def messages(bag: BagReader, plan: Plan, start: float = 0.0, duration: float | None = None) -> Iterator[RawMessage]:

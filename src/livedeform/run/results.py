@@ -25,6 +25,7 @@ from livedeform.comparing.takes import Take, with_repeats
 from livedeform.outputs import write_json
 from livedeform.report.run.read import residuals_of
 from livedeform.report.text import OF_THIS_RECORDING, WITH_PLACES
+from livedeform.run.said import Said, stereo_said
 from livedeform.run.surfaces import compare_surfaces, write_surface_csv
 
 COLUMNS = (
@@ -48,13 +49,16 @@ def write_results(
 ) -> RunMetrics:
     """Both files, from ``out/run.mcap``; ``about`` goes into the JSON's head. They are the same for the same run.
 
-    ``findings`` about the inputs keep the verdict from being OK where they doubt it, and make it STALE where they are
-    errors. ``recording`` is ``out/run.mcap`` where it was loaded already; ``repeats`` are runs of other takes.
+    ``findings`` about the inputs, and what the stereo node says of its measurement, keep the verdict from being OK
+    where they doubt it, and make it STALE where they are errors. ``recording`` is ``out/run.mcap`` where it was loaded
+    already; ``repeats`` are runs of other takes.
     """
     recording = recording or load_recording(out / "run.mcap", experiment)
     residuals = residuals_of(recording)
     metrics = with_places(run_metrics(residuals, experiment.thresholds.error), residuals, experiment.markers)
     surfaces = compare_surfaces(out / "run.mcap")
+    said = stereo_said(out / "run.mcap")
+    counts, findings = with_reasons(counts, said), [*findings, *said.findings]
     metrics = replace(
         metrics,
         interpolation_bound=interpolation_bound,
@@ -72,6 +76,13 @@ def write_results(
     if surfaces is not None:
         write_surface_csv(out / SURFACE_CSV, surfaces[1])
     return metrics
+
+
+def with_reasons(counts: Mapping[str, Any], said: Said) -> dict[str, Any]:
+    """Return the nodes' counts with what the stereo node ``said`` against its own measurement."""
+    if not said.times:
+        return dict(counts)
+    return dict(counts) | {"stereo": {**(counts.get("stereo") or {}), "reasons": said.reasons}}
 
 
 def _registration(about: Mapping[str, Any]) -> float:

@@ -137,7 +137,7 @@ class Nodes:
 
     @property
     def interpolation_bound(self) -> float:
-        return self.compare.interpolation_bound if self.compare is not None else float("nan")
+        return self.compare.associator.interpolation_bound.value if self.compare is not None else float("nan")
 
 
 def run(options: RunOptions, tell: Tell) -> RunMetrics:
@@ -204,9 +204,10 @@ def _checked(
     """Return what is played, and how it serves the experiment; refuses what does not, and says what is in doubt."""
     plan = replay.plan(bag, experiment, at_frames=options.at_frames)
     _refuse_empty(plan, options)
-    recording = load_recording(options.bag, experiment)
-    recording = replay.cut(recording, bag, plan, options.start, options.duration)
-    findings = fit_findings(bag, experiment, recording)
+    whole = load_recording(options.bag, experiment)
+    recording = replay.cut(whole, bag, plan, options.start, options.duration)
+    found = [*fit_findings(bag, experiment, recording), *replay.check_cut(whole, recording, experiment)]
+    findings = list(dict.fromkeys(found))
     refuse_errors(findings, str(options.bag))
     if options.rate is not None:
         replay.refuse_pauses(bag, plan)
@@ -267,7 +268,9 @@ def make_nodes(experiment: Path, plan: replay.Plan, options: RunOptions, start_n
     if plan.measured == "images" or plan.corrected:
         source = "pictures" if plan.measured == "images" else "markers"
         place = recorded_camera_pose(options.bag) if source == "markers" else ""
-        stereo = StereoNode(common | {"source": source, "rest_markers": rest, "camera_pose": place, "lone_after": 0.0})
+        asked = {"source": source, "rest_markers": rest, "camera_pose": place, "lone_after": 0.0}
+        follows = {} if plan.trigger == "poses" else {"surface_wait": 0.0}  # a prediction follows its frame
+        stereo = StereoNode(common | asked | follows)
     compare = CompareNode(
         {"experiment": str(experiment), "stale_after": 0.0 if lock_step else 2.0, "best_effort": False}
     )

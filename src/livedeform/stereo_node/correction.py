@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -14,10 +15,12 @@ from livedeform.common.types import Array, MarkerFrame, Pose
 from livedeform.stereo_node.camera.rig import StereoRig
 from livedeform.stereo_node.camera.setup import declared_camera_pose, rig_of
 from livedeform.stereo_node.effects import EFFECTS, Surface, View, correct_all
+from livedeform.stereo_node.surfaces import PredictedSurfaces
 
 __all__ = ["MeasuringCorrection", "format_pose", "make_view", "parse_pose"]
 
 NEED_SURFACE = {"refraction"}
+NO_SURFACE = "no /fem/surface is near their moment; check that fem_node runs and poses come"
 
 
 def make_view(
@@ -53,7 +56,9 @@ def make_view(
 class MeasuringCorrection:
     """The inverse of an experiment's measuring effects; False, and does nothing, if there are none.
 
-    ``start_ns`` 0: the recording starts with the first frame.
+    ``start_ns`` 0: the recording starts with the first frame. Where internal markers are seen through the predicted
+    surface, a frame waits until that of its moment is in ``surfaces``, for ``wait`` s of the frames' stamps at most; 0:
+    it does not wait, since predictions follow frames.
     """
 
     def __init__(
@@ -62,17 +67,19 @@ class MeasuringCorrection:
         start_ns: int = 0,
         T_phantom_left: Array | None = None,
         rest: Array | None = None,
+        wait: float = 0.0,
     ) -> None:
         self._effects = [effect for effect in experiment.effects if effect.name in EFFECTS]
         self._experiment, self._start_ns = experiment, start_ns
         self._T_phantom_left, self._rest = T_phantom_left, rest
         self._rig: StereoRig | None = None
         self._view: View | None = None
-        self.surface: Surface | None = None  # the predicted one, as of now
+        self.surfaces = PredictedSurfaces()
+        self._wait_ns, self._waiting = round(wait * 1e9), deque[MarkerFrame]()
 
     @property
     def needs_surface(self) -> bool:
-        """Return whether ``surface`` must be kept up to date."""
+        """Return whether ``surfaces`` must be kept up to date."""
         return any(effect.name in NEED_SURFACE for effect in self._effects)
 
     def __bool__(self) -> bool:
@@ -82,9 +89,38 @@ class MeasuringCorrection:
         """Take where the cameras are, once that is known."""
         self._T_phantom_left, self._rig, self._view = T_phantom_left, rig, None
 
+    def take(self, frame: MarkerFrame) -> list[tuple[MarkerFrame, str]]:
+        """Take a measured frame and return what is `ready` now."""
+        self._waiting.append(frame)
+        return self.ready()
+
+    def hear(self, stamp_ns: int, surface: Array) -> list[tuple[MarkerFrame, str]]:
+        """Take the points (m, 3) m of a predicted surface and return what is `ready` now."""
+        self.surfaces.add(stamp_ns, surface)
+        return self.ready()
+
+    def ready(self, *, ended: bool = False) -> list[tuple[MarkerFrame, str]]:
+        """Return the corrected frames that wait no more (none does where the input ``ended``), in their order, each
+        with what is wrong with it."""
+        out = []
+        while self._waiting and (ended or not self._waits(self._waiting[0].stamp_ns)):
+            frame = self._waiting.popleft()
+            corrected = self.apply(frame)
+            n = self._n_internal(frame) - self._n_internal(corrected)
+            out.append((corrected, f"{n} internal markers are left out: {NO_SURFACE}" if n else ""))
+        return out
+
+    def _waits(self, stamp_ns: int) -> bool:
+        waited = abs(self._waiting[-1].stamp_ns - stamp_ns)
+        return self.needs_surface and waited < self._wait_ns and self.surfaces.awaited(stamp_ns)
+
+    def _n_internal(self, frame: MarkerFrame) -> int:
+        markers = self._experiment.markers
+        return int(np.isin(frame.ids, markers.ids[np.asarray(markers.kinds) == "internal"]).sum())
+
     def apply(self, frame: MarkerFrame) -> MarkerFrame:
         """Return the frame as a rig without these effects would have measured it; markers that are not declared are
-        left out.
+        left out, and internal ones where the surface that refracts their rays is not known.
 
         The covariances are left as they are, since the effects change lengths by percents; but what refraction
         divides a depth by, its index, multiplies the scatter of internal markers when it is taken out.
@@ -99,9 +135,11 @@ class MeasuringCorrection:
                 T_phantom_left=self._T_phantom_left,
                 rig=self._rig,
                 rest=self._rest,
-                surface=lambda stamp_ns: self.surface,
+                surface=self.surfaces.at,
             )
         known = np.isin(frame.ids, self._view.ids)
+        if self.needs_surface and self.surfaces.at(frame.stamp_ns) is None:
+            known &= ~np.isin(frame.ids, self._view.ids[self._view.kinds == "internal"])
         points = correct_all(frame.points[known], frame.stamp_ns, self._effects, self._view.for_ids(frame.ids[known]))
         covariances = frame.covariances[known].copy()
         for effect in self._effects:

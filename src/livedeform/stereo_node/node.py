@@ -16,8 +16,7 @@ from livedeform.common.experiment.yaml_file import load_experiment
 from livedeform.common.ros import messages as m
 from livedeform.common.ros.node import CountingNode, run
 from livedeform.common.ros.session import RELIABLE, SENSOR, declare
-from livedeform.common.types import CameraCalibration
-from livedeform.stereo_node.correction import MeasuringCorrection, parse_pose
+from livedeform.common.types import CameraCalibration, MarkerFrame
 from livedeform.stereo_node.pairing import Pictures
 from livedeform.stereo_node.parameters import StereoParameters
 from livedeform.stereo_node.pipeline import StereoTracker, detector_of
@@ -34,24 +33,23 @@ class StereoNode(CountingNode):
         self.pairs = settings.picture_pairs()
         self.tracker: StereoTracker | None = None
         self._rest = settings.rest()
-        place = parse_pose(settings.camera_pose)
-        self.correction = MeasuringCorrection(self.experiment, settings.start_ns, place, self._rest)
+        self.correction = settings.correction(self.experiment)
         self._cameras: dict[str, CameraCalibration] = {}
         self._prior = settings.prior(self.experiment.markers.ids)
         self._markers = self.publisher(PointCloud2, t.STEREO_MARKERS)
         if self.correction.needs_surface:
             self.subscribe(Marker, t.FEM_MESH, self.on_mesh)
+            hear = self.correction.hear
+            self.subscribe(PointCloud2, t.FEM_SURFACE, lambda said: self.publish(hear(*m.from_predicted_surface(said))))
         if settings.model_prior:
-            self.subscribe(PointCloud2, t.FEM_MARKERS, self.on_prediction)
+            self.subscribe(PointCloud2, t.FEM_MARKERS, lambda said: self._prior.add(m.from_predicted_markers(said)))
         quality = SENSOR if settings.best_effort else RELIABLE
         if settings.source == "markers":
             self.subscribe(PointCloud2, t.STEREO_MARKERS_RAW, self.on_markers, quality, gate=True)
             return
         self._uncorrected = self.publisher(PointCloud2, t.STEREO_MARKERS_RAW) if self.correction else None
         self._registration = self.publisher(TransformStamped, t.STEREO_REGISTRATION)
-        for kind, left, right in (
-            (Image, t.LEFT_IMAGE, t.RIGHT_IMAGE), (CompressedImage, t.LEFT_COMPRESSED, t.RIGHT_COMPRESSED),
-        ):  # fmt: skip
+        for kind, (left, right) in ((Image, t.IMAGES), (CompressedImage, t.COMPRESSED_IMAGES)):
             self.subscribe(kind, left, partial(self.on_picture, self.pairs.add_left), quality, gate=True)
             self.subscribe(kind, right, partial(self.on_picture, self.pairs.add_right), quality, gate=True)
         for side, topic in (("left", t.LEFT_CAMERA_INFO), ("right", t.RIGHT_CAMERA_INFO)):
@@ -86,29 +84,31 @@ class StereoNode(CountingNode):
                 self.register(left.stamp_ns)
                 if self._uncorrected is not None:
                     self._uncorrected(m.to_marker_cloud(frame))
-                self._markers(m.to_marker_cloud(self.correction.apply(frame)))
+                self.publish(self.correction.take(frame))
                 self.status(left.stamp_ns, status.level.upper(), status.message, asdict(status) | self.pairs.counts())
 
     def finish(self) -> None:
         super().finish()
         self.measure(self.pairs.flush())
-
-    def on_prediction(self, message: PointCloud2) -> None:
-        """Take the markers' places that the model predicts."""
-        self._prior.add(m.from_predicted_markers(message))
+        with self.bad_input_said():
+            self.publish(self.correction.ready(ended=True))
 
     def on_mesh(self, message: Marker) -> None:
-        """Take the predicted surface, through which internal markers are seen."""
-        self.correction.surface = m.from_mesh_marker(message) or self.correction.surface
+        self.correction.surfaces.add_mesh(m.from_time(message.header.stamp), m.from_mesh_marker(message))
 
     def on_markers(self, message: PointCloud2) -> None:
-        """Correct and publish another tracker's markers."""
-        self._markers(m.to_marker_cloud(self.correction.apply(m.from_marker_cloud(message))))
+        self.publish(self.correction.take(m.from_marker_cloud(message)))  # another tracker's
+
+    def publish(self, corrected: Sequence[tuple[MarkerFrame, str]]) -> None:
+        """Publish corrected frames, and what is wrong with them."""
+        for frame, trouble in corrected:
+            self._markers(m.to_marker_cloud(frame))
+            if trouble:
+                self.status(frame.stamp_ns, "WARN", trouble)
 
     def register(self, stamp_ns: int) -> None:
         """Publish where the cameras are, once it is known."""
-        said = bool(self.traffic.sent[t.STEREO_REGISTRATION])
-        if said or self.tracker is None or self.tracker.T_phantom_left is None:
+        if self.traffic.sent[t.STEREO_REGISTRATION] or self.tracker is None or self.tracker.T_phantom_left is None:
             return
         self.correction.cameras(self.tracker.T_phantom_left, self.tracker.rig)
         for transform in m.to_camera_transforms(stamp_ns, self.tracker.T_phantom_left, self.tracker.rig.T_right_left):

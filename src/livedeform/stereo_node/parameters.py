@@ -6,8 +6,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from livedeform.common.experiment.markers_file import read_markers
+from livedeform.common.experiment.schema import Experiment
 from livedeform.common.node_parameters import LATEST_NS, within
 from livedeform.common.types import Array, Ids
+from livedeform.stereo_node.correction import MeasuringCorrection, parse_pose
 from livedeform.stereo_node.pairing import PicturePairs
 from livedeform.stereo_node.track.model_prior import ModelPrior
 
@@ -26,6 +28,8 @@ class StereoParameters:
     ``start_ns``: the recording's start (0: the first stamp).
     ``model_prior``: look for markers that come back where ``/fem/markers`` predicts them, as far as the markers that
     are seen agree. ``model_prior_age``: s by which that prediction may be older or newer than the pictures.
+    ``surface_wait``: s that a frame waits for the surface that is predicted at its moment, where a refraction is
+    corrected; 0 where ``fem_node`` predicts at frames. Without a probe none waits.
     """
 
     experiment: str = ""
@@ -39,6 +43,7 @@ class StereoParameters:
     start_ns: int = within(0, 0, LATEST_NS)
     model_prior: bool = False
     model_prior_age: float = within(0.2, 0.0, 10.0)
+    surface_wait: float = within(0.5, 0.0, 10.0)
 
     def picture_pairs(self) -> PicturePairs:
         """Return what pairs the pictures."""
@@ -47,6 +52,11 @@ class StereoParameters:
     def rest(self) -> Array | None:
         """Return the markers at rest (n, 3) m; None where they are as the experiment declares them."""
         return read_markers(Path(self.rest_markers)).points if self.rest_markers else None
+
+    def correction(self, experiment: Experiment) -> MeasuringCorrection:
+        """Return what takes the experiment's measuring effects out."""
+        wait = 0.0 if experiment.probe is None else self.surface_wait
+        return MeasuringCorrection(experiment, self.start_ns, parse_pose(self.camera_pose), self.rest(), wait)
 
     def prior(self, ids: Ids) -> ModelPrior:
         """Return what keeps the predictions of the markers ``ids``."""

@@ -168,8 +168,7 @@ class Body:
 
     def _surfaces(self, simulated: Simulation) -> dict[int, Surface]:
         """Return the predicted surface by stamp: vertices (n, 3) m and triangles."""
-        triangles = self._simulator.corner_triangles()
-        return {p.stamp_ns: (p.surface, triangles) for p in simulated.predictions if p.converged}
+        return {p.stamp_ns: (p.surface, p.triangles) for p in simulated.predictions if p.converged}
 
     def _measured(
         self,

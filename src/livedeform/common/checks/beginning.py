@@ -27,18 +27,33 @@ def check_beginning(recording: Recording, experiment: Experiment, body: Surface)
         return []
     path = probe_path(recording.poses, experiment.probe.shape, body, recording.start_ns)
     limit = clear_limit(recording, experiment, body)
-    surely = path.depths[0] > TOUCH + sag_bound(experiment, body)  # `check_probe` says so
+    surely = begins_inside(recording, experiment, body)
     if surely or not (_as_deep_as_later(path) or _force_shows(recording, path, float(path.seconds[0]), limit)):
         return []
     return [_within_a_press(float(path.seconds[0]))]
 
 
+def begins_inside(recording: Recording, experiment: Experiment, body: Surface) -> bool:
+    """Tell whether the probe begins in the body, however that may sag: `check_probe` says so."""
+    if experiment.probe is None or not recording.poses:
+        return False
+    path = probe_path(recording.poses, experiment.probe.shape, body, recording.start_ns)
+    return float(path.depths[0]) > TOUCH + sag_bound(experiment, body)
+
+
 def check_start(
-    whole: Recording, experiment: Experiment, body: Surface, start: float, remembers: Sequence[str], rubs: Sequence[str]
+    whole: Recording,
+    experiment: Experiment,
+    body: Surface,
+    start: float,
+    remembers: Sequence[str],
+    rubs: Sequence[str],
+    *,
+    said: bool = False,
 ) -> list[Finding]:
     """Check what is left out of a ``whole`` recording that is run from ``start`` s on: a press that is under way, and
     presses before it, where the model ``remembers`` these for the reasons given, or, while the probe touches, since it
-    ``rubs``."""
+    ``rubs``. That it begins inside the body may be ``said`` already."""
     if experiment.probe is None or not whole.poses or start <= 0.0:
         return []
     path = probe_path(whole.poses, experiment.probe.shape, body, whole.start_ns)
@@ -48,7 +63,7 @@ def check_start(
     within = any(a <= start <= b for a, b in presses) or _is_deep(path, start)
     if within or _force_shows(whole, path, start, limit):
         remembers = [*remembers, *rubs]
-        found.append(_within_a_press(start))
+        found += [] if said else [_within_a_press(start)]
     if remembers and (_went_in_before(path, start) or any(a < start for a, _ in presses)):
         text = f"--start {start:.3g} s leaves out presses that the model would remember ({', '.join(remembers)})"
         found.append(Finding("WARN", text, "run the recording from its beginning", doubts=True))

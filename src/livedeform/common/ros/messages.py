@@ -164,6 +164,11 @@ def to_predicted_surface(prediction: Prediction) -> PointCloud2:
     return to_cloud(prediction.stamp_ns, rows)
 
 
+def from_predicted_surface(message: PointCloud2) -> tuple[int, Array]:
+    """Return stamp (ns) and points (m, 3) m of ``/fem/surface``."""
+    return from_time(message.header.stamp), layouts.points(layouts.unpack(message))
+
+
 def to_compare_cloud(stamp_ns: int, ids: Ids, measured: Array, error: Array) -> PointCloud2:
     """Make ``/compare/markers``: ``measured`` (n, 3) and ``error`` (n, 3) = measured - predicted, m."""
     ex, ey, ez = error.T
@@ -224,11 +229,16 @@ def _serialised(message: Marker, n_points: int) -> bytes:
 
 
 def from_mesh_marker(message: Marker) -> tuple[Array, NDArray[np.int64]] | None:
-    """Return corners (3 k, 3) m and triangles (k, 3) of ``/fem/mesh``; None where it is deleted."""
+    """Return points (m, 3) m and triangles (k, 3) of ``/fem/mesh``; None where it is deleted.
+
+    The message has three corners for each triangle. Those that are equal are one point, which its triangles share:
+    a surface whose corners are all alone has no neighbours, and no smooth normals.
+    """
     if message.action != Marker.ADD or not message.points:
         return None
     corners = np.array([(p.x, p.y, p.z) for p in message.points])
-    return corners, np.arange(len(corners), dtype=np.int64).reshape(-1, 3)
+    points, rows = np.unique(corners, axis=0, return_inverse=True)
+    return points, np.asarray(rows, np.int64).reshape(-1, 3)
 
 
 def _paint(message: Marker, colour: tuple[float, float, float, float]) -> None:

@@ -39,6 +39,7 @@ MEANING = {
     "matched_markers": "single errors",
     "lost_messages": "sent, but not received",
     "measured_without_prediction": "measured markers that the model did not predict",
+    "measured_twice": "measured markers of a frame that share their id; none of them is compared",
     "predicted_without_measurement": "predicted markers that were not seen (occluded, or not found)",
     "frames_without_common_marker": "measured frames none of whose markers the model knows",
     "predicted": "frames that the model was asked for",

@@ -47,6 +47,7 @@ def load_evidence(run_dir: Path, experiment: Experiment) -> RunEvidence:
     residuals = residuals_of(recording)
     metrics = replace(
         with_places(run_metrics(residuals, experiment.thresholds.error), residuals, experiment.markers),
+        interpolation_bound=_known(document.get("interpolation_bound")),
         coverage=read_coverage(document.get("coverage")),
         doubts=tuple(document.get("doubts", ())),
         wrong=tuple(document.get("wrong", ())),
@@ -78,6 +79,11 @@ def read_metrics(file: Path, remedy: str) -> dict[str, Any]:
         return dict(json.loads(file.read_text()))
     except (OSError, ValueError, TypeError) as error:
         raise InputError("is not what livedeform run wrote", where=str(file), remedy=remedy) from error
+
+
+def _known(value: Any) -> float:
+    """Return a number of ``metrics.json``, where null is what is not known."""
+    return float("nan") if value is None else float(value)
 
 
 def _distances(path: Path) -> Mapping[str, Array]:
