@@ -217,10 +217,27 @@ def cases(half: str, n: int = 180) -> list[Case]:
 
 def run_case(case: Case, out: Path, keep: bool) -> dict[str, Any]:
     """Make and fit one case and write ``out/<case>.json``, unless that is there; ``keep`` also writes what was fitted,
-    for a look at why an interval missed."""
+    for a look at why an interval missed.
+
+    A case that raises has its ``error`` there, so that it is counted, and is begun again by the next run.
+    """
     done = out / f"{case.name}.json"
     if done.is_file():
-        return dict(json.loads(done.read_text()))
+        result = dict(json.loads(done.read_text()))
+        if "error" not in result:
+            return result
+    try:
+        result = _made_and_fitted(case, out, keep)
+    except Exception as error:  # one that cannot be made or fitted must not end the others
+        result = {"case": case.name, "error": f"{type(error).__name__}: {error}"}
+    temporary = done.with_suffix(".part")
+    temporary.write_text(json.dumps(result, indent=1))
+    temporary.replace(done)
+    return result
+
+
+def _made_and_fitted(case: Case, out: Path, keep: bool) -> dict[str, Any]:
+    """Return what was fitted of a case, and the CPU seconds that it took."""
     folder, began = out / case.name, resources()
     shutil.rmtree(folder, ignore_errors=True)
     make(
@@ -251,9 +268,6 @@ def run_case(case: Case, out: Path, keep: bool) -> dict[str, Any]:
         with (out / f"{case.name}.pickle").open("wb") as file:
             pickle.dump((inputs.fitted, inputs.uncertain, inputs.element_size, model, problem), file)
     shutil.rmtree(folder, ignore_errors=True)
-    temporary = done.with_suffix(".part")
-    temporary.write_text(json.dumps(result, indent=1))
-    temporary.replace(done)
     return result
 
 
@@ -324,16 +338,19 @@ def numbers_of(result: Mapping[str, Any]) -> list[Number]:
 
 
 def table(results: Iterable[Mapping[str, Any]]) -> list[str]:
-    """Tabulate each family's coverage, and what its parameters are off by."""
-    results = list(results)
-    numbers = [n for r in results for n in numbers_of(r)]
-    lines = [f"{len(results)} experiments"]
+    """Tabulate each family's coverage, and what its parameters are off by; those that have no fit are listed last."""
+    begun = list(results)
+    fitted = [r for r in begun if "error" not in r]
+    numbers = [n for r in fitted for n in numbers_of(r)]
+    lines = [f"{len(fitted)} experiments"]
+    if len(fitted) < len(begun):
+        lines[0] += f"; {len(begun) - len(fitted)} of {len(begun)} could not be made or fitted, and are in no share"
     for family in sorted({n.family for n in numbers}):
         lines.append(_line(family, [n for n in numbers if n.family == family]))
     lines += [_line("all", numbers), ""]
     for parameter in sorted({n.parameter for n in numbers}):
         lines.append(_line(parameter, [n for n in numbers if n.parameter == parameter]))
-    return lines
+    return lines + [f"without a fit: {r['case']}: {r['error']}" for r in begun if "error" in r]
 
 
 def _line(what: str, numbers: Sequence[Number]) -> str:
@@ -346,6 +363,14 @@ def _line(what: str, numbers: Sequence[Number]) -> str:
         f"{what:32s} {100 * k / n:5.1f} %  ({k} of {n}, 95 %: {100 * low:.0f}-{100 * high:.0f})  "
         f"median |z| {np.median(np.abs(z)):.2f}, median z {np.median(z):+.2f}, largest {np.abs(z).max():.1f}"
     )
+
+
+def _told(result: Mapping[str, Any]) -> str:
+    """Say in a line what came of a case."""
+    if "error" in result:
+        return str(result["error"])
+    z = " ".join(f"{n.parameter.split('.')[1]} {n.z:+.1f}" for n in numbers_of(result))
+    return f"{z}  ({result['made']:.0f} + {result['seconds']:.0f} s)"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -367,12 +392,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if options.what == "run":
         os.environ.update(ONE_THREAD)
         for case in wanted:
-            try:
-                result = run_case(case, options.out, options.keep)
-                z = " ".join(f"{n.parameter.split('.')[1]} {n.z:+.1f}" for n in numbers_of(result))
-                print(f"{case.name}: {z}  ({result['made']:.0f} + {result['seconds']:.0f} s)", flush=True)
-            except Exception as error:  # one that cannot be made or read must not end the others
-                print(f"{case.name}: {type(error).__name__}: {error}", flush=True)
+            print(f"{case.name}: {_told(run_case(case, options.out, options.keep))}", flush=True)
     if options.what == "again":
         for case in wanted:
             again(case, options.out)

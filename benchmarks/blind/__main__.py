@@ -21,7 +21,7 @@ from benchmarks.blind.foreign_cases import foreign
 from benchmarks.blind.random_cases import randomised
 from benchmarks.blind.redeclared_cases import redeclared
 from benchmarks.blind.run import TRUTHS, run_all
-from benchmarks.blind.table import score, table
+from benchmarks.blind.table import score, table, unmade
 
 SETS = {**OWN_SETS, "foreign": foreign, "random": randomised, "redeclared": redeclared}
 
@@ -48,7 +48,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if options.what == "run":
         truth = options.truth or ("felupe" if options.set == "foreign" else "own")
         run_all(cases, options.out, options.jobs, options.keep, truth, options.sizes)
-    print("\n".join(table(s for s in (score(c, options.out) for c in cases) if s is not None)))
+    scores = [s for s in (score(c, options.out) for c in cases) if s is not None]
+    reasons = {c.name: unmade(c, options.out) for c in cases}
+    print("\n".join(table(scores, {name: reason for name, reason in reasons.items() if reason is not None})))
     return 0
 
 

@@ -9,7 +9,7 @@ ratio again.
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Hashable, Mapping
 from dataclasses import dataclass
 from itertools import product
 from typing import Any
@@ -113,6 +113,9 @@ VISIBLE: dict[str, dict[str, Any]] = {
     "probe_offset": {"translation": [1.1e-4, 0.0, 4.1e-4]},
     "thermal_expansion": {"alpha": 3e-4},  # of WARMING
 }
+# what some effects need an experiment to declare is declared in such a share of all others as well
+BESIDES = 0.4
+MODULUS_SIGMA = 0.02  # of the modulus, for the density's of STANDARD where that is not declared
 NUMBERED_LAST = ("thermal_expansion",)  # after all others: a case that results are kept of keeps its seed
 WARMING: dict[str, Any] = {"time": [0.0, 12.0, 40.0], "value": [20.0, 30.0, 20.0], "reference": 20.0}  # degrees Celsius
 NEUTRAL: dict[str, float] = {"ratio": 1.0, "scale": 1.0, "index": 1.0, "value": 0.49}
@@ -150,6 +153,12 @@ class Case:
     def truth(self) -> tuple[str, ...]:
         return tuple(str(e["name"]) for e in self.effects)
 
+    @property
+    def distinct(self) -> Hashable:
+        """Return what tells the case from those that are pressed alike and have the same true effects, so that they
+        differ in nothing but noise and in what is declared."""
+        return self.body, self.kind == "poor", self.truth, self.size, self.seed % N_PLANS
+
     def scenario(self) -> dict[str, Any]:
         """The scenario of the case; the seed varies where and how deep the probe presses."""
         plain, presses = (STANDARD, PRESSES) if self.body == "block" else (DOME, DOME_PRESSES)
@@ -157,16 +166,36 @@ class Case:
         spec["name"] = f"experiment-{self.seed:04d}"  # says nothing of what is the matter
         spec["truth"] = [dict(e) for e in self.effects]
         spec["recordings"] = _varied(POOR if self.kind == "poor" else presses, self.seed)
-        if "refraction" in self.truth:
-            spec["markers"]["internal"] = 8
-        if "thermal_expansion" in self.truth:
-            spec["temperature"] = copy.deepcopy(WARMING)
-        if "density" in self.truth:  # who has weighed it to one per cent does not err by eight
-            spec["declared"]["sigmas"] = {"youngs_modulus": 80.0}
+        declare_sigmas(spec, self.truth, self.seed)
+        declare_besides(spec, self.truth, self.seed)
         if "scan_gravity" in self.truth and self.seed % 2:
             spec["declared"]["configuration"] = "loaded"
             spec["truth"][self.truth.index("scan_gravity")]["fraction"] = 1.0 - self.effects[0]["fraction"]
         return spec
+
+
+def declare_sigmas(spec: dict[str, Any], truth: Collection[str], seed: int) -> None:
+    """Declare how well the modulus is known, or else the density: by the seed alone, so that it says nothing of the
+    truth, but for the two effects that would belie it. Who has weighed it to one per cent does not err by eight.
+    """
+    modulus = "density" in truth or ("stiffness" not in truth and _drawn_besides(seed)[0])
+    if modulus:
+        spec["declared"]["sigmas"] = {"youngs_modulus": MODULUS_SIGMA * spec["declared"]["youngs_modulus"]}
+
+
+def declare_besides(spec: dict[str, Any], truth: Collection[str], seed: int) -> None:
+    """Add a temperature and inner markers where the truth needs them, and in a share of all other cases."""
+    _, warming, inner = _drawn_besides(seed)
+    if "thermal_expansion" in truth or warming:
+        spec["temperature"] = copy.deepcopy(WARMING)
+    if "refraction" in truth or inner:
+        spec["markers"]["internal"] = 8
+
+
+def _drawn_besides(seed: int) -> tuple[bool, bool, bool]:
+    """Draw what is declared, by a generator of its own: bodies, presses and effects of a seed are what they were."""
+    modulus, warming, inner = np.random.default_rng([12, seed]).random(3) < BESIDES
+    return bool(modulus), bool(warming), bool(inner)
 
 
 def _varied(plan: Mapping[str, Any], seed: int) -> dict[str, Any]:

@@ -7,11 +7,11 @@ cases of a body and a probe press alike, so that those with measuring effects al
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping
+from collections.abc import Hashable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from benchmarks.blind.cases import STANDARD, Case, sized
+from benchmarks.blind.cases import STANDARD, Case, declare_sigmas, sized
 
 GOOD, POOR_TRACKER = 0.08, 0.24  # px
 ONSET = 4.0  # s, of what moves a camera: between the presses of recording a
@@ -61,9 +61,13 @@ class ForeignCase(Case):
             ],
             "b": [{"at": [xc, yc], "depth": other, "stroke": [-0.004, 0.003], **stroke}],
         }
-        if "density" in self.truth:  # who has weighed it to one per cent does not err by sixteen
-            spec["declared"]["sigmas"] = {"youngs_modulus": 80.0}
+        declare_sigmas(spec, self.truth, self.seed)
         return spec
+
+    @property
+    def distinct(self) -> Hashable:
+        """Return what tells it from those that are pressed alike and measured by other means."""
+        return self.truth, self.size, self.body, self.probe
 
 
 # name, body, probe, tracker, rate, element: first those that share a body with others, so that a part is worth most

@@ -6,19 +6,31 @@ shuffled for each half, so that none comes twice before all have come, every thi
 others at 2 x. After these come cases of what is rarer (``RARER``), in turn, and from number ``AGAIN`` on common ones
 again. Sizes are scaled from what is visible on the standard block (`benchmarks.blind.cases`) by the tracker's noise,
 and by the modulus where the weight or a stiffness shows them; how large they are there is measured
-(`benchmarks.blind.sizes`).
+(`benchmarks.blind.sizes`). How well the modulus or the density is known, a temperature and inner markers are drawn for
+every case, so that they do not tell the effects that need them.
 """
 
 from __future__ import annotations
 
 import copy
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from benchmarks.blind.cases import OUTSIDE, PAIRS, POOR, STANDARD, VISIBLE, WARMING, Case, end_at_balls, sized
+from benchmarks.blind.cases import (
+    OUTSIDE,
+    PAIRS,
+    POOR,
+    STANDARD,
+    VISIBLE,
+    Case,
+    declare_besides,
+    declare_sigmas,
+    end_at_balls,
+    sized,
+)
 
 NOISE, MODULUS = 0.08, 4000.0  # px and Pa, of the standard block
 BY_WEIGHT = ("stiffness", "gravity_tilt", "density", "scan_gravity")  # the stiffer the body, the less they show
@@ -53,13 +65,14 @@ class RandomCase(Case):
         end_at_balls(spec)
         if "ball" in spec["body"]:
             spec["body"]["elements"] = elements_of(spec["body"]["size"], ROUND_A_BALL)
-        if "refraction" in self.truth:
-            spec["markers"]["internal"] = 8
-        if "thermal_expansion" in self.truth:
-            spec["temperature"] = copy.deepcopy(WARMING)
-        if "density" in self.truth:  # who has weighed it to one per cent does not err by more
-            spec["declared"]["sigmas"] = {"youngs_modulus": 0.02 * spec["declared"]["youngs_modulus"]}
+        declare_sigmas(spec, self.truth, self.seed)
+        declare_besides(spec, self.truth, self.seed)
         return spec
+
+    @property
+    def distinct(self) -> Hashable:
+        """Return the seed, which draws body and presses."""
+        return self.seed
 
 
 def conditions(seed: int, effects: Collection[str]) -> dict[str, Any]:

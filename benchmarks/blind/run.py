@@ -52,37 +52,58 @@ def run_all(cases: Sequence[Case], out: Path, jobs: int, keep: bool, truth: str 
 
 def run_case(case: Case, out: Path, keep: bool = False, truth: str = "own", sizes: bool = False) -> None:
     """Make and diagnose one case, and write ``out/<case>/result.json``, unless that is there; sizes that it lacks are
-    added to one that is there where its recordings were kept."""
+    added to one that is there where its recordings were kept.
+
+    A case that raises leaves its ``error`` there, so that it is counted, and is begun again by the next run.
+    """
     folder = out / case.name
     done = folder / "result.json"
-    if done.is_file():
-        result = json.loads(done.read_text())
-        if sizes and case.effects and "size_over_noise" not in result and (folder / "bags").is_dir():
-            _write(done, result | _size(folder, case, truth))
-        return
-    shutil.rmtree(folder, ignore_errors=True)
+    result = _document(done)
+    new = result is None or "error" in result
+    if new:
+        shutil.rmtree(folder, ignore_errors=True)
+        folder.mkdir(parents=True)
+        try:
+            result = _made_and_diagnosed(case, out, truth)
+        except Exception as error:
+            _write(done, {"error": f"{type(error).__name__}: {error}", "truth": truth})
+            raise
+        _write(done, result)  # before its size, which may not be measurable
+    if sizes and case.effects and "size_over_noise" not in result and (folder / "bags").is_dir():
+        _write(done, result | _size(folder, case, truth))
+    if new and not keep:
+        for part in ("bags", "experiment", "diagnosis"):
+            shutil.rmtree(folder / part, ignore_errors=True)
+
+
+def _made_and_diagnosed(case: Case, out: Path, truth: str) -> dict[str, Any]:
+    """Return the result of a case, but for its size, with its experiment, recordings and report in ``out/<case>``."""
+    folder = out / case.name
     kept = out / ("bodies" if truth == "own" else f"bodies-{truth}")
     began = resources()
     make(case.scenario(), folder, case.seed, kept=kept, mesher=mesh_to_file, solver=TRUTHS[truth])
     made = resources() - began
-    result = _diagnose(folder, case.seed) | {"truth": truth, "making_cpu_seconds": made}
-    if sizes and case.effects:
-        result |= _size(folder, case, truth)
-    if not keep:
-        for part in ("bags", "experiment", "diagnosis"):
-            shutil.rmtree(folder / part, ignore_errors=True)
-    _write(done, result)
+    return _diagnose(folder, case.seed) | {"truth": truth, "making_cpu_seconds": made}
 
 
-def _size(folder: Path, case: Case, truth: str) -> dict[str, float]:
+def _size(folder: Path, case: Case, truth: str) -> dict[str, Any]:
+    """Return a case's size, or NaN with the reason where it cannot be measured: the declared model of a diagnosis that
+    failed may have no equilibrium."""
+    try:
+        return {"size_over_noise": _measured_size(folder, case, truth)}
+    except Exception as error:
+        return {"size_over_noise": float("nan"), "size_error": f"{type(error).__name__}: {error}"}
+
+
+def _measured_size(folder: Path, case: Case, truth: str) -> float:
     """Measure a case's effects over the noise: by the loop's model, or by a second truth without them if it does not
     know them."""
     if not set(case.truth) & set(OUTSIDE):
         true = case.scenario()["truth"]  # which may differ from the case's effects: a scan that is loaded
-        return {"size_over_noise": size_over_noise(folder / "experiment", folder / "bags" / "a", true)}
+        return size_over_noise(folder / "experiment", folder / "bags" / "a", true)
     with tempfile.TemporaryDirectory() as plain:
         make(case.scenario() | {"truth": []}, Path(plain), case.seed, mesher=mesh_to_file, solver=TRUTHS[truth])
-        return {"size_over_noise": size_of_truth(folder, Path(plain))}
+        return size_of_truth(folder, Path(plain))
 
 
 def _write(path: Path, result: Mapping[str, Any]) -> None:

@@ -139,8 +139,9 @@ def main() -> None:
         if not names:
             continue
         with tempfile.TemporaryDirectory() as folder:
-            case = cases.Case("plain", "none", (), 0.0, 0).scenario() | changes
-            make(case, Path(folder) / "plain", 0, mesher=mesh_to_file)
+            plain = {key: cases.STANDARD.get(key) for key in ("declared", "markers", "temperature")}
+            spec = cases.Case("plain", "none", (), 0.0, 0).scenario() | plain | changes
+            make(spec, Path(folder) / "plain", 0, mesher=mesh_to_file)
             at = Path(folder) / "plain"
             inputs = read_inputs(at / "experiment", [at / "bags" / "a"], [at / "bags" / "b"])
             measure(inputs, names, options.size)

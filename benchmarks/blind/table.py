@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -51,11 +51,10 @@ class Score:
 
     @property
     def in_set(self) -> bool:
-        """Named right, or every true effect is named or among at most three that cannot be told apart."""
+        """Named right, or every true effect is among at most three, of those named and those that cannot be told from
+        them."""
         together = set(self.named) | set(self.alternatives)
-        return self.right or (
-            self.verdict == "effect" and len(self.alternatives) <= 2 and set(self.case.truth) <= together
-        )
+        return self.right or (self.verdict == "effect" and len(together) <= 3 and set(self.case.truth) <= together)
 
     @property
     def false_alarm(self) -> bool:
@@ -68,11 +67,11 @@ class Score:
 
 
 def score(case: Case, out: Path) -> Score | None:
-    """Judge a finished case; None if it is not finished. A diagnosis that failed counts as ``failed``."""
-    path = out / case.name / "result.json"
-    if not path.is_file():
+    """Judge a finished case; None if it is not finished, or could not be made. A diagnosis that failed counts as
+    ``failed``."""
+    result = _result(case, out)
+    if result is None or "error" in result:
         return None
-    result = json.loads(path.read_text())
     found, seconds = result["diagnosis"], float(result["seconds"])
     if found is None:
         nan = float("nan")
@@ -96,6 +95,18 @@ def score(case: Case, out: Path) -> Score | None:
         strength=float(result.get("size_over_noise", "nan")),
         expected=_expected(case, found),
     )
+
+
+def unmade(case: Case, out: Path) -> str | None:
+    """Return why a case that was begun could not be made; None of all others."""
+    result = _result(case, out)
+    return None if result is None or "error" not in result else str(result["error"])
+
+
+def _result(case: Case, out: Path) -> dict[str, Any] | None:
+    """Return what ``run`` left of a case; None where there is nothing."""
+    path = out / case.name / "result.json"
+    return dict(json.loads(path.read_text())) if path.is_file() else None
 
 
 def _expected(case: Case, found: Mapping[str, Any]) -> float:
@@ -148,13 +159,14 @@ def compare(
     true: Mapping[str, Any], parameters: Mapping[str, Any], nothing: Mapping[str, float] = NEUTRAL
 ) -> tuple[list[float], list[bool]]:
     """Return the errors of an effect's numbers, relative to how far from ``nothing`` the ``true`` ones are, and whether
-    their intervals hold these."""
+    their intervals hold these: those of numbers that are more or fewer than the true ones do not."""
     errors, covered = [], []
     for name, fitted in parameters.items():
         if name not in true:
             continue
         t, v = np.atleast_1d(np.asarray(true[name], float)), np.atleast_1d(np.asarray(fitted["value"], float))
         if t.shape != v.shape:
+            covered += [False] * v.size
             continue
         angle = name == "direction" and t.size == 1  # the same after a turn, and without a size to be wrong by
         t = t + 2.0 * np.pi * np.round((v - t) / (2.0 * np.pi)) if angle else t
@@ -175,10 +187,19 @@ def _ends(interval: Any, value: Array, sigma: Array) -> Array:
     return np.where(np.isfinite(ends), ends, [[-np.inf], [np.inf]])
 
 
-def table(scores: Iterable[Score]) -> list[str]:
-    """The figures of the blind test with their counts and 95 % bounds (Clopper & Pearson 1934)."""
+def table(scores: Iterable[Score], reasons: Mapping[str, str] | None = None) -> list[str]:
+    """The figures of the blind test with their counts and 95 % bounds (Clopper & Pearson 1934).
+
+    ``reasons``: why cases could not be made, by their names; nothing is known of their diagnoses, so that they are
+    listed and are in no share. Bounds are by as many experiments as are distinct (`Case.distinct`): what is pressed
+    alike and has the same true effects may be misjudged alike.
+    """
     all_ = list(scores)
-    lines = [f"{len(all_)} experiments, {sum(s.verdict == 'failed' for s in all_)} diagnoses failed", ""]
+    lines = [f"{len(all_)} experiments, {sum(s.verdict == 'failed' for s in all_)} diagnoses failed"]
+    if reasons:
+        lines.append(f"{len(reasons)} of {len(all_) + len(reasons)} could not be made, and are in no share below:")
+        lines += [f"  {name}: {reason}" for name, reason in reasons.items()]
+    lines.append("")
     lines += [*_shares(all_), *_medians(all_), "", *_of_baselines(all_)]
     singles = _of_kind(all_, "single")
     measured = [(s.strength, s.right, s.expected) for s in singles if np.isfinite(s.strength)]
@@ -190,27 +211,42 @@ def _of_kind(scores: Iterable[Score], *kinds: str, size: float | None = None) ->
     return [s for s in scores if s.case.kind in kinds and (size is None or s.case.size == size)]
 
 
+def _each(scores: Iterable[Score], told: Callable[[Score], bool]) -> list[tuple[Hashable, bool]]:
+    """Return what is told of each score, beside what makes its experiment distinct."""
+    return [(s.case.distinct, told(s)) for s in scores]
+
+
 def _shares(scores: Sequence[Score]) -> list[str]:
     """Tabulate how often the diagnoses were right, wrong, or in a small set, with the goals."""
-    singles, wrong_of = _of_kind(scores, "single"), _of_kind(scores, "single", "pair", "outside")
-    at = {size: _of_kind(singles, "single", size=size) for size in (0.5, 1.0, 2.0, 3.0)}
+
+    def right(*kinds: str, size: float | None = None) -> list[tuple[Hashable, bool]]:
+        return _each(_of_kind(scores, *kinds, size=size), lambda s: s.right)
+
+    def in_set(*kinds: str, size: float | None = None) -> list[tuple[Hashable, bool]]:
+        return _each(_of_kind(scores, *kinds, size=size), lambda s: s.in_set)
+
+    def undecided(*kinds: str, size: float | None = None) -> list[tuple[Hashable, bool]]:
+        return _each(_of_kind(scores, *kinds, size=size), lambda s: s.verdict == "undecided")
+
+    singles, wrong_of = _of_kind(scores, "single"), _of_kind(scores, "single", "pair", "outside", "poor")
+    held = [((s.case.distinct, i), c) for s in singles for i, c in enumerate(s.covered)]
     return [
-        _share("named right at 3 x noise", [s.right for s in at[3.0]], ""),
-        _share("named right at 2 x noise", [s.right for s in at[2.0]], ">= 95 %"),
-        _share("named right at 1 x noise", [s.right for s in at[1.0]], ">= 85 %"),
-        _share("named right at 0.5 x noise", [s.right for s in at[0.5]], ""),
-        _share("right, or in a set of at most 3, at 2 x", [s.in_set for s in at[2.0]], ">= 98 %"),
-        _share("undecided at 2 x", [s.verdict == "undecided" for s in at[2.0]], ""),
-        _share("undecided at 1 x", [s.verdict == "undecided" for s in at[1.0]], ""),
-        _share("right, or in a set of at most 3, at 3 x", [s.in_set for s in at[3.0]], ""),
-        _share("pairs named right", [s.right for s in _of_kind(scores, "pair")], ""),
-        _share("pairs: right, or in a set", [s.in_set for s in _of_kind(scores, "pair")], ""),
-        _share("false alarms without an effect", [s.false_alarm for s in _of_kind(scores, "none")], "<= 3 %"),
-        _share("undecided without an effect", [s.verdict == "undecided" for s in _of_kind(scores, "none")], ""),
-        _share("confidently wrong", [s.confidently_wrong for s in wrong_of], "<= 1 %"),
-        _share("outside effects called unexplained", [s.right for s in _of_kind(scores, "outside")], ">= 90 %"),
-        _share("poor trajectory: right, or in a set", [s.in_set for s in _of_kind(scores, "poor")], ""),
-        _share("95 % intervals that hold the truth", [c for s in singles for c in s.covered], "93-97 %"),
+        _share("named right at 3 x noise", right("single", size=3.0), ""),
+        _share("named right at 2 x noise", right("single", size=2.0), ">= 95 %"),
+        _share("named right at 1 x noise", right("single", size=1.0), ">= 85 %"),
+        _share("named right at 0.5 x noise", right("single", size=0.5), ""),
+        _share("right, or in a set of at most 3, at 2 x", in_set("single", size=2.0), ">= 98 %"),
+        _share("undecided at 2 x", undecided("single", size=2.0), ""),
+        _share("undecided at 1 x", undecided("single", size=1.0), ""),
+        _share("right, or in a set of at most 3, at 3 x", in_set("single", size=3.0), ""),
+        _share("pairs named right", right("pair"), ""),
+        _share("pairs: right, or in a set", in_set("pair"), ""),
+        _share("false alarms without an effect", _each(_of_kind(scores, "none"), lambda s: s.false_alarm), "<= 3 %"),
+        _share("undecided without an effect", undecided("none"), ""),
+        _share("confidently wrong", _each(wrong_of, lambda s: s.confidently_wrong), "<= 1 %"),
+        _share("outside effects called unexplained", right("outside"), ">= 90 %"),
+        _share("poor trajectory: right, or in a set", in_set("poor"), ""),
+        _share("95 % intervals that hold the truth", held, "93-97 %"),
     ]
 
 
@@ -234,8 +270,9 @@ def _of_baselines(scores: Sequence[Score]) -> list[str]:
     nones = [(s, m) for s, m in known if s.case.kind == "none"]
     lines = []
     for key, what in (("bic", "BIC over the same library"), ("signature", "likeness of signatures")):
-        lines.append(_share(f"{what}: named right, 1 x and more", [m[key] in s.case.truth for s, m in singles], ""))
-        lines.append(_share(f"{what}: false alarms", [m[key] != "none" for _, m in nones], ""))
+        named = [(s.case.distinct, m[key] in s.case.truth) for s, m in singles]
+        lines.append(_share(f"{what}: named right, 1 x and more", named, ""))
+        lines.append(_share(f"{what}: false alarms", [(s.case.distinct, m[key] != "none") for s, m in nones], ""))
     lines += _of_falsification(singles, nones)
     ours = [s.removed for s, _ in singles if np.isfinite(s.removed)]
     lines.append(_median("median share of the excess removed: livedeform", ours, 100.0, "%", ""))
@@ -251,29 +288,33 @@ def _of_falsification(
 ) -> list[str]:
     """Return lines on model falsification: it names a set, the larger the less it tells."""
     left = [(s, m["edmf"]) for s, m in singles if "edmf" in m]
+    alarms = [(s.case.distinct, "none" not in m["edmf"]) for s, m in nones if "edmf" in m]
     what = "EDMF over the same library"
-    found = ["none" not in names and bool(set(s.case.truth) & set(names)) for s, names in left]
+    found = [(s.case.distinct, "none" not in names and bool(set(s.case.truth) & set(names))) for s, names in left]
+    falsified = [(s.case.distinct, "none" not in names) for s, names in left]
     return [
-        _share(f"{what}: falsifies what was declared", ["none" not in names for _, names in left], ""),
+        _share(f"{what}: falsifies what was declared", falsified, ""),
         _share(f"{what}: and leaves the true effect", found, ""),
         _median(f"{what}: models left", [len(names) for _, names in left], 1.0, "", ""),
-        _share(f"{what}: false alarms", ["none" not in m["edmf"] for _, m in nones if "edmf" in m], ""),
+        _share(f"{what}: false alarms", alarms, ""),
     ]
 
 
-def bounds(k: int, n: int) -> tuple[float, float]:
+def bounds(k: float, n: float) -> tuple[float, float]:
     """Return the 95 % interval of a share of which ``k`` of ``n`` were seen (Clopper & Pearson 1934)."""
     low = float(beta.ppf(0.025, k, n - k + 1)) if k else 0.0
     high = float(beta.ppf(0.975, k + 1, n - k)) if k < n else 1.0
     return low, high
 
 
-def _share(what: str, hits: Sequence[bool], goal: str) -> str:
-    n, k = len(hits), int(np.sum(hits))
+def _share(what: str, hits: Sequence[tuple[Hashable, bool]], goal: str) -> str:
+    """Return the line of a share; ``hits``: what makes an experiment distinct, and whether it counts, of each."""
+    n, k, m = len(hits), sum(hit for _, hit in hits), len({key for key, _ in hits})
     if n == 0:
         return f"{what:52s} -"
-    low, high = bounds(k, n)
-    return f"{what:52s} {100 * k / n:5.1f} %  ({k}/{n}, 95 %: {100 * low:.0f}-{100 * high:.0f})  {goal}"
+    low, high = bounds(k * m / n, m)
+    of = f"{k}/{n}" if m == n else f"{k}/{n} of {m} distinct"
+    return f"{what:52s} {100 * k / n:5.1f} %  ({of}, 95 %: {100 * low:.0f}-{100 * high:.0f})  {goal}"
 
 
 def _pooled(singles: Sequence[Score], nones: Sequence[Score]) -> str:

@@ -9,14 +9,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 from benchmarks.blind import cases as blind_cases
+from benchmarks.blind import run as blind_run
 from benchmarks.blind.detection import curve, predicted, times_visible
+from benchmarks.blind.foreign_cases import foreign
 from benchmarks.blind.random_cases import MODULUS, NOISE, conditions, drawn_effect, randomised
 from benchmarks.blind.redeclared_cases import redeclared
 from benchmarks.blind.sizes import moved_between
-from benchmarks.blind.table import compare, score, table
+from benchmarks.blind.table import Score, bounds, compare, score, table, unmade
 from scipy.stats import norm
 
 from livedeform.closed_loop.settings import Settings
+from livedeform.common.errors import ConvergenceError
 from livedeform.synthetic import scenario
 from livedeform.synthetic.solved_motion import build_world
 
@@ -135,6 +138,48 @@ def test_an_inclusion_is_drawn_in_a_block_where_the_elements_of_the_truth_end_at
     assert all(body["shape"] == "block" and "ball" in body for body in within)
 
 
+def declared_of(case: blind_cases.Case) -> tuple[set[str], bool, int]:
+    """Return which sigmas a case declares, whether it has a temperature, and how many inner markers."""
+    spec = scenario.load(case.scenario())
+    return set(spec["declared"]["sigmas"]), spec["temperature"] is not None, spec["markers"]["internal"]
+
+
+def test_what_is_declared_tells_no_effect() -> None:
+    """Only a true density had a modulus that is known, only a true expansion a temperature, only a true refraction
+    inner markers: none of the three could raise a false alarm, or be the rival of another effect."""
+    alike = ("skin", "time_offset", "base_slip")
+    for seed in range(40):
+        of = [declared_of(blind_cases.Case("c", "single", (blind_cases.sized(n, 2.0),), 2.0, seed)) for n in alike]
+        assert of == [declared_of(blind_cases.Case("c", "none", (), 0.0, seed))] * 3
+    for cases in (randomised(), blind_cases.large()):
+        nones = [declared_of(c) for c in cases if c.kind == "none"]
+        assert len(nones) >= 80
+        known, warm, inner = zip(*nones, strict=True)
+        for drawn in ([k == {"youngs_modulus"} for k in known], warm, [n == 8 for n in inner]):
+            assert 0.25 < np.mean(drawn) < 0.55  # drawn with 0.4
+
+
+def test_every_effect_has_what_it_needs_and_nothing_that_is_declared_is_belied() -> None:
+    for cases in (randomised(), blind_cases.large(), blind_cases.dome(), redeclared(), foreign()):
+        for case in cases:
+            sigmas, temperature, internal = declared_of(case)
+            assert temperature or "thermal_expansion" not in case.truth
+            assert internal or "refraction" not in case.truth
+            assert len(sigmas) == 1 and not sigmas & {"density": {"density"}, "stiffness": {"youngs_modulus"}}.get(
+                "".join(set(case.truth) & {"density", "stiffness"}), set()
+            )
+
+
+def test_what_is_declared_is_drawn_apart_from_the_bodies_and_presses_of_a_seed() -> None:
+    for case in randomised(40):
+        spec, drawn = case.scenario(), conditions(case.seed, case.truth)
+        for key in ("probe", "measuring", "wrench", "path_step", *([] if case.kind == "poor" else ["recordings"])):
+            assert spec[key] == drawn[key]
+        assert spec["markers"] | {"internal": 0} == drawn["markers"]
+        assert spec["declared"] | {"sigmas": {}} == drawn["declared"] | {"sigmas": {}}
+        assert "inclusion" in case.truth or spec["body"] == drawn["body"]
+
+
 def test_what_is_redeclared_is_right_or_half_of_what_is() -> None:
     cases = redeclared()
     assert {n for c in cases for n in c.truth if c.kind == "single"} == set(blind_cases.VISIBLE)
@@ -227,3 +272,113 @@ def test_two_truths_are_compared_marker_by_marker_whatever_their_order(tmp_path)
     assert np.isnan(d[:, 4]).all()
     others = np.arange(9) != 4
     np.testing.assert_allclose(d[:, others], 0.5 * moved[[2, 3]][:, others], atol=1e-12)
+
+
+def judged(case: blind_cases.Case, verdict: str, named: tuple[str, ...] = (), rivals: tuple[str, ...] = ()) -> Score:
+    """A score of an answer, without numbers."""
+    nan = float("nan")
+    return Score(case, verdict, named, rivals, (), (), nan, nan, nan, 1.0)
+
+
+@pytest.mark.parametrize(
+    ("named", "rivals", "truth", "in_set"),
+    [
+        (("skin",), ("density", "stiffness"), ("stiffness",), True),
+        (("skin",), ("density", "stiffness", "swelling"), ("stiffness",), False),
+        (("skin", "base_slip", "gravity_tilt"), ("density", "stiffness"), ("stiffness",), False),  # five names
+        (("skin", "base_slip", "gravity_tilt"), (), ("skin",), True),
+        (("skin", "base_slip"), ("stiffness",), ("stiffness", "skin"), True),
+        (("skin", "base_slip"), ("density",), ("stiffness", "skin"), False),
+    ],
+)
+def test_a_set_of_three_has_three_names(
+    named: tuple[str, ...], rivals: tuple[str, ...], truth: tuple[str, ...], in_set: bool
+) -> None:
+    case = blind_cases.Case("c", "single", tuple(blind_cases.sized(n, 2.0) for n in truth), 2.0, 0)
+    assert judged(case, "effect", named, rivals).in_set == in_set
+    assert not judged(case, "undecided", named, rivals).in_set
+
+
+def test_who_is_confidently_wrong_is_counted_of_all_that_have_an_effect() -> None:
+    kinds = ("single", "pair", "outside", "poor")
+    cases = [blind_cases.Case(k, k, (blind_cases.sized("stiffness", 2.0),), 2.0, i) for i, k in enumerate(kinds)]
+    text = "\n".join(table(judged(c, "effect", ("skin",)) for c in cases))
+    assert "confidently wrong                                    100.0 %  (4/4" in text
+
+
+def test_numbers_that_the_truth_does_not_have_do_not_hold_it() -> None:
+    """A relaxation of two terms, for one that is true, was left out of the count of intervals."""
+    fitted = {"g": {"value": [0.1, 0.04], "sigma": [0.02, 0.02]}, "tau": {"value": [3.0, 9.0], "sigma": [1.0, 1.0]}}
+    assert compare({"name": "viscoelasticity", "g": [0.14], "tau": [4.0]}, fitted) == ([], [False] * 4)
+    one = {"g": {"value": [0.13], "sigma": [0.02]}, "tau": {"value": [4.5], "sigma": [1.0]}}
+    assert compare({"name": "viscoelasticity", "g": [0.14], "tau": [4.0]}, one)[1] == [True, True]
+
+
+def test_bounds_are_by_distinct_experiments() -> None:
+    """Eighty experiments without an effect on the block are six that differ in noise: what misleads one may mislead
+    all that are pressed alike."""
+    nones = [c for c in blind_cases.large() if c.kind == "none"]
+    assert len(nones) == 80 and len({c.distinct for c in nones}) == blind_cases.N_PLANS
+    text = "\n".join(table(judged(c, "none") for c in nones))
+    assert "(0/80 of 6 distinct, 95 %: 0-46)" in text
+    assert [round(b, 3) for b in bounds(0.0, 6.0)] == [0.0, 0.459]  # 1 - 0.025^(1/6)
+    drawn = [c for c in randomised() if c.kind == "none"]
+    assert len({c.distinct for c in drawn}) == len(drawn)
+    lines = table(judged(c, "none") for c in drawn)
+    assert f"(0/{len(drawn)}, 95 %: 0-" in "\n".join(lines)
+    assert len({c.distinct for c in foreign() if c.kind == "none"}) == 3  # of eleven
+
+
+def test_a_case_that_could_not_be_made_is_counted_and_begun_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It left nothing behind, and the table said that there were so many experiments fewer."""
+    cases = [blind_cases.Case(f"none-{k}", "none", (), 0.0, k) for k in range(6)]
+    answer = {
+        "verdict": "none", "effects": [], "candidates": [], "error_before": {"rmse": 2e-4},
+        "error_after": {"rmse": 2e-4}, "noise_floor": 2e-4,
+    }  # fmt: skip
+
+    def make(spec: dict, folder: Path, seed: int, **options: object) -> None:
+        if seed % 2:
+            raise ConvergenceError("the contact does not settle", remedy="press less deep")
+
+    monkeypatch.setattr(blind_run, "make", make)
+    monkeypatch.setattr(blind_run, "_diagnose", lambda folder, seed: {"diagnosis": answer, "seconds": 1.0})
+    for case in cases:
+        try:
+            blind_run.run_case(case, tmp_path)
+        except ConvergenceError:
+            assert case.seed % 2
+    reasons = {c.name: unmade(c, tmp_path) for c in cases}
+    scores = [s for s in (score(c, tmp_path) for c in cases) if s is not None]
+    lines = table(scores, {name: reason for name, reason in reasons.items() if reason})
+    assert lines[0] == "3 experiments, 0 diagnoses failed" and lines[1].startswith("3 of 6 could not be made")
+    assert sum("the contact does not settle" in line for line in lines) == 3
+    monkeypatch.setattr(blind_run, "make", lambda *given, **options: None)
+    for case in cases:
+        blind_run.run_case(case, tmp_path)
+    assert [unmade(c, tmp_path) for c in cases] == [None] * 6
+
+
+@pytest.mark.parametrize("keep", [False, True])
+def test_a_size_that_cannot_be_measured_takes_no_diagnosis_away(
+    keep: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A diagnosis that failed since the declared model has no equilibrium was no experiment at all with --sizes."""
+    case = blind_cases.Case("s", "single", (blind_cases.sized("stiffness", 2.0),), 2.0, 1)
+
+    def no_equilibrium(*given: object) -> float:
+        assert json.loads((tmp_path / "s" / "result.json").read_text())["code"] == 2  # is written before
+        raise ConvergenceError("no equilibrium at rest", remedy="a stiffer body")
+
+    monkeypatch.setattr(blind_run, "make", lambda spec, folder, *given, **options: (folder / "bags").mkdir())
+    monkeypatch.setattr(blind_run, "_diagnose", lambda *given: {"diagnosis": None, "code": 2, "seconds": 3.0})
+    monkeypatch.setattr(blind_run, "size_over_noise", no_equilibrium)
+    blind_run.run_case(case, tmp_path, keep=keep, sizes=True)
+    found = score(case, tmp_path)
+    assert found is not None and found.verdict == "failed" and np.isnan(found.strength)
+    assert "no equilibrium at rest" in json.loads((tmp_path / "s" / "result.json").read_text())["size_error"]
+    lines = table([found])
+    assert lines[0] == "1 experiments, 1 diagnoses failed" and "of 1 more the size is not measured" in lines
+    assert (tmp_path / "s" / "bags").is_dir() == keep

@@ -1,9 +1,12 @@
 """The benchmark of intervals: its two halves share nothing, its truth is exact where modulus jumps, it counts right."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from benchmarks.coverage import BODIES, FineTruth, cases, numbers_of, table
 
+from benchmarks import coverage
 from livedeform.synthetic.solved_motion import SHAPES, build_world
 
 
@@ -68,3 +71,26 @@ def test_it_counts_intervals_and_not_sigmas() -> None:
     lines = table([result, result])
     assert lines[0] == "2 experiments"
     assert lines[1].startswith("layers") and "(2 of 4, 95 %: 7-93)" in lines[1]
+
+
+def test_a_case_without_a_fit_is_listed_and_begun_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    """Three of six that raised left "3 experiments", of which every interval held."""
+    names, again = [c.name for c in cases("proof", 6)], {"effect": "skin", "family": "layers", "made": 1.0}
+    fitted = again | {"seconds": 1.0, "numbers": [["ratio", 1.3, 0.1, 1.25, 1.1, 1.6]]}
+
+    def made_and_fitted(case: coverage.Case, out: Path, keep: bool) -> dict:
+        if case.name in names[::2]:
+            raise ValueError("no start of it can be solved")
+        return fitted
+
+    monkeypatch.setattr(coverage, "_made_and_fitted", made_and_fitted)
+    command = ["run", "--limit", "6", "--out", str(tmp_path)]
+    for said in (command, ["table", *command[1:]], ["again", *command[1:]]):
+        assert coverage.main(said) == 0
+        text = capsys.readouterr().out
+        assert "3 experiments; 3 of 6 could not be made or fitted" in text and "(3 of 3," in text
+        assert text.count("without a fit: ") == 3 and "ValueError: no start of it can be solved" in text
+    monkeypatch.setattr(coverage, "_made_and_fitted", lambda *given: fitted)
+    assert coverage.main(command) == 0 and "6 experiments\n" in capsys.readouterr().out

@@ -112,7 +112,9 @@ def stereo(
 @app.command(cls=StudyCommand)
 def height(
     out: Out = None,
-    data: Annotated[Path | None, typer.Option(help="Your own SOFA position file, or a folder of *_x.txt.")] = None,
+    data: Annotated[
+        Path | None, typer.Option(help="Your own SOFA position file, or a folder of *_x.txt: metres, z up.")
+    ] = None,
     bag: Annotated[Path | None, typer.Option(help="A run or recording with your own markers.")] = None,
     top: Annotated[str, typer.Option(help="Numbers of its markers on top, as 5,6.")] = "",
     bottom: Annotated[str, typer.Option(help="Numbers of its markers at the bottom.")] = "",

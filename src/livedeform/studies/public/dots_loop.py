@@ -130,9 +130,9 @@ def without_distortion(rig: StereoRig) -> StereoRig:
 
 
 def measure(rig: StereoRig, seen: DotsSeen) -> tuple[Array, Triangulated]:
-    """T_phantom_left (4, 4), registered on the dots at rest, and the dots in the left frame."""
+    """T_phantom_left (4, 4), registered on the fitted dots at rest, and all dots in the left frame."""
     points = triangulate(rig, seen.left, seen.right, sigma_px=SIGMA_PX)
-    return fit_rigid(points.points, seen.places), points
+    return fit_rigid(points.points[seen.fitted], seen.places[seen.fitted]), points
 
 
 def one_term(rig: StereoRig, in_left: Array) -> float:

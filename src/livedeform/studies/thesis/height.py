@@ -1,7 +1,8 @@
 """Heights (thesis 2.2 to 2.4): of measured points, of the model, and of SOFA's exported positions.
 
-The thesis takes the highest minus the lowest point. Of n noisy points that is too large: the extremes of noise are
-added to the extremes of the body. The study shows by how much, and what does not have that fault.
+The thesis measures a phantom between a top and a bottom point that are picked (2.2, 2.4), and the model between the
+highest and the lowest of its particles, which have no noise (2.3). Of n noisy points that would be too large: the
+extremes of noise are added to the extremes of the body. The study shows by how much, and what does not have that fault.
 """
 
 from __future__ import annotations
@@ -17,14 +18,15 @@ from livedeform.common.types import Array
 from livedeform.report.page import Table
 from livedeform.studies.bodies import cuboid
 from livedeform.studies.own.heights import OwnHeights
-from livedeform.studies.study import COLOURS, HOLDS, PARTLY, Progress, StudyPage, figure
+from livedeform.studies.study import COLOURS, FAILS, HOLDS, Progress, StudyPage, figure
 from livedeform.studies.thesis.sofa import SofaPositions, read_sofa_positions
+from livedeform.studies.thesis.stereo import LENGTH_SD, POINT_SD
 
 HEIGHT, YOUNG = 0.07, 2896.0  # m, Pa
-SIGMA = 0.0011  # m, of one measured point along z (thesis 3.1)
 COUNTS = (2, 4, 8, 16, 32, 64)
 SEED, N_DRAWS = 7, 4000
 SLICES = 7
+SCENE = "They are taken as written in metres with z up; the half width is half of the extent along x."
 MM = 1e3
 
 
@@ -34,9 +36,14 @@ def run(out: Path, data: Path | None, progress: Progress, *, own: OwnHeights | N
     page = StudyPage(
         "height",
         "How tall is it?",
-        "Highest minus lowest point: how wrong is that with noisy points, and how does one read SOFA's exports?",
+        "Two picked points, or highest minus lowest: how wrong is that with noisy points, and how does one read SOFA's "
+        "exports?",
         out,
-        inputs={"cuboid": f"{HEIGHT * MM:g} mm, E = {YOUNG:g} Pa", "sigma of a point": f"{SIGMA * MM:g} mm"},
+        inputs={
+            "cuboid": f"{HEIGHT * MM:g} mm, E = {YOUNG:g} Pa",
+            "sigma of a length": f"{LENGTH_SD * MM:g} mm",
+            "sigma of a point along it": f"{POINT_SD * MM:.2f} mm",
+        },
         seed=SEED,
     )
     if own is not None:
@@ -77,8 +84,8 @@ def extremes_bias(n: int, sigma: float, rng: np.random.Generator, draws: int = N
 
 def _noise(page: StudyPage) -> None:
     rng = np.random.default_rng(SEED)
-    extremes = np.array([extremes_bias(n, SIGMA, rng) for n in COUNTS])
-    means = SIGMA * np.sqrt(2.0 / np.array(COUNTS))
+    extremes = np.array([extremes_bias(n, POINT_SD, rng) for n in COUNTS])
+    means = POINT_SD * np.sqrt(2.0 / np.array(COUNTS))
     fig, ax = figure(6.0, 3.0)
     ax.errorbar(COUNTS, extremes[:, 0] * MM, extremes[:, 1] * MM, fmt="o-", capsize=3, label="highest minus lowest")
     ax.errorbar(
@@ -96,20 +103,37 @@ def _noise(page: StudyPage) -> None:
     ax.minorticks_off()
     ax.legend()
     page.numbers["bias_m"] = dict(zip(map(str, COUNTS), extremes[:, 0], strict=True))
-    two = extremes_bias(1, SIGMA, rng)
-    page.claim(
-        "The height is the highest minus the lowest point",
-        "used; ± 1.1 mm",
-        f"± {two[1] * MM:.1f} mm with one point at either end; + {extremes[3, 0] * MM:.1f} mm too tall with "
-        f"{COUNTS[3]}",
-        PARTLY,
-        "Two points carry two errors, and the extremes of many points are biased. Means of marked points are not.",
-    )
+    bias, sigma = extremes_bias(1, POINT_SD, rng)
+    _claims_of_points(page, bias, sigma, extremes[3, 0], means[3])
     page.section(
         "Noise makes bodies taller",
-        f"Each point has an error of {SIGMA * MM:g} mm along z. Points and bars: mean and standard deviation over "
-        f"{N_DRAWS} draws.",
+        f"Lengths between two points err by {LENGTH_SD * MM:g} mm (thesis 3.1), so each point by "
+        f"{POINT_SD * MM:.2f} mm along the height. Points and bars: mean and standard deviation over {N_DRAWS} draws.",
         figures=[("height_noise", fig, "Error of the height by how it is read.")],
+    )
+
+
+def _claims_of_points(page: StudyPage, bias: float, sigma: float, extreme: float, mean: float) -> None:
+    """Judge both of the thesis's ways to read a height, each for what it was used for.
+
+    ``bias`` and ``sigma`` m of two points; ``extreme``, the bias of highest minus lowest, and ``mean``, the sigma of a
+    difference of means, m with ``COUNTS[3]`` points at either end.
+    """
+    page.claim(
+        "A top and a bottom point that are picked give the phantom's height (2.2)",
+        f"± {LENGTH_SD * MM:.1f} mm",
+        f"{bias * MM:+.1f} ± {sigma * MM:.1f} mm; means of {COUNTS[3]} points at either end: ± {mean * MM:.1f} mm",
+        HOLDS if abs(bias) < 0.1 * sigma else FAILS,
+        "1.1 mm is how much lengths scatter (3.1), with the errors of both points in it; no bias, if the points are "
+        "the same ones each time.",
+    )
+    page.claim(
+        "Highest minus lowest particle is the height of the SOFA model (2.3)",
+        "used on the model alone",
+        f"right without noise; of measured points + {extreme * MM:.1f} mm too tall with {COUNTS[3]} at either end",
+        HOLDS,
+        "The thesis does not read measured points so. Extremes of noisy points are biased, means of marked ones are "
+        "not.",
     )
 
 
@@ -159,7 +183,7 @@ def _exports_section(
     """Show the heights of the files, and the slices of the first one."""
     page.section(
         "SOFA's exports",
-        "Files that SOFA's Monitor (tabs and spaces) and WriteState (T= and X= lines) write. "
+        f"Files that SOFA's Monitor (tabs and spaces) and WriteState (T= and X= lines) write. {SCENE} "
         + ("No file was given with --data: the model's positions were written in both formats." if own else ""),
         tables=[
             Table(
@@ -168,7 +192,7 @@ def _exports_section(
                 numbers=(1, 2, 3, 4),
             ),
             Table(
-                ("slice from below", "height of its particles (mm)", "mean half width (mm)"),
+                ("slice from below", "height of its particles (mm)", "half width (mm)"),
                 tuple(slices),
                 numbers=(1, 2),
             ),
@@ -197,7 +221,8 @@ def sofa_files(data: Path | None) -> list[Path]:
 
 
 def slice_heights(positions: SofaPositions) -> list[tuple[str, str, str]]:
-    """Mean height and half width of the particles in equal slices of the first state, in the last state."""
+    """Mean height, and half of the extent along x, of the particles in equal slices of the first state, in the last
+    one."""
     first, last = positions.points[0], positions.points[-1]
     edges = np.linspace(first[:, 2].min(), first[:, 2].max(), SLICES + 1)
     which = np.clip(np.digitize(first[:, 2], edges) - 1, 0, SLICES - 1)
@@ -205,7 +230,7 @@ def slice_heights(positions: SofaPositions) -> list[tuple[str, str, str]]:
     for k in range(SLICES):
         part = last[which == k]
         if len(part):
-            rows.append((f"{k + 1}", f"{part[:, 2].mean() * MM:.2f}", f"{np.abs(part[:, 0]).max() * MM:.2f}"))
+            rows.append((f"{k + 1}", f"{part[:, 2].mean() * MM:.2f}", f"{0.5 * np.ptp(part[:, 0]) * MM:.2f}"))
     return rows
 
 

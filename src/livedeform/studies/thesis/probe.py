@@ -29,6 +29,7 @@ from livedeform.report.page import Table
 from livedeform.studies.own.press import OwnPress, run_own
 from livedeform.studies.study import COLOURS, FAILS, HOLDS, OPEN, PARTLY, Progress, StudyPage, figure
 from livedeform.studies.thesis.pressed_truth import TruePhantom, TruePress
+from livedeform.studies.thesis.stereo import LENGTH_SD, POINT_SD
 from livedeform.synthetic.truth.physics import TruthPhysics
 from livedeform.synthetic.truth.probe import TruthProbe
 
@@ -40,7 +41,6 @@ TRUE_FRICTION = 0.3
 CELLS = 6
 TRUE_MESH, COARSE_TRUTH = (6, 2), (4, 2)  # hexahedra across the core, and shells round it
 N_MARKERS = 30
-SIGMA_POINT = 0.0011 / np.sqrt(3.0)  # m per coordinate: the thesis's random error of 1.1 mm as a length
 BEFORE, AFTER = 0.0052, 0.0083  # m, the thesis's two maxima
 LIMIT = 0.005  # m, the thesis's requirement
 LESION = np.array([0.0, 0.010, 0.060])  # about; m
@@ -83,7 +83,7 @@ def run(out: Path, data: Path | None, progress: Progress, own: OwnPress | None =
                 "probe": f"{PROBE[0] * MM:g} x {PROBE[1] * MM:g} mm, {DEPTH * MM:g} mm deep",
                 "truth": f"27-node hexahedra, {TRUE_MESH[0]} across in {TRUE_MESH[1]} shells, friction "
                 f"{TRUE_FRICTION:g}; the model: {CELLS} cells of quadratic tetrahedra, no friction",
-                "noise": f"{SIGMA_POINT * MM:.2f} mm per coordinate"},
+                "noise": f"{POINT_SD * MM:.2f} mm per coordinate: lengths err by {LENGTH_SD * MM:g} mm"},
         seed=SEED,
     )  # fmt: skip
     body = TruePhantom((RADIUS, RADIUS, HEIGHT), *TRUE_MESH)
@@ -237,13 +237,13 @@ def _draw_maxima(error: Array) -> Maxima:
         # any turned and shuffled pattern of the error's size: the static error does not know where the model is wrong
         d = error[rng.permutation(n)] * (size / largest) * rng.choice([-1.0, 1.0])
         static = rng.normal(0.0, 0.0017, (n, 3))
-        before = static + rng.normal(0.0, SIGMA_POINT, (n, 3))
-        after = static + d + rng.normal(0.0, SIGMA_POINT, (n, 3))
+        before = static + rng.normal(0.0, POINT_SD, (n, 3))
+        after = static + d + rng.normal(0.0, POINT_SD, (n, 3))
         a, b = (np.linalg.norm(e, axis=1).max() for e in (after, before))
         difference[k] = a - b
         change = np.linalg.norm(after - before, axis=1)
-        corrected[k] = np.sqrt(max((change**2).mean() - 6.0 * SIGMA_POINT**2, 0.0))
-        kept[k] = abs(a - AFTER) < SIGMA_POINT * 2 and abs(b - BEFORE) < SIGMA_POINT * 2
+        corrected[k] = np.sqrt(max((change**2).mean() - 6.0 * POINT_SD**2, 0.0))
+        kept[k] = abs(a - AFTER) < 2.0 * POINT_SD and abs(b - BEFORE) < 2.0 * POINT_SD
     rms_true = true_max * np.sqrt((np.linalg.norm(error, axis=1) ** 2).mean()) / largest
     return Maxima(true_max, rms_true, difference, corrected, kept)
 
