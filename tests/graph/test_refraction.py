@@ -102,7 +102,7 @@ def test_a_run_takes_out_the_refraction_that_a_diagnosis_puts_in(dome: Dome, tmp
     assert off(dome, frames, tmp_path / "out").max() < 1e-7  # measured 2e-9; it was 1e-3
 
 
-@pytest.mark.parametrize("share", [0.1, 0.5])
+@pytest.mark.parametrize("share", [pytest.param(0.1, marks=pytest.mark.slow), 0.5])
 def test_a_frame_is_seen_through_the_surface_of_its_own_moment(share: float, dome: Dome, tmp_path: Path):
     """Frames between poses: that of the pose before was taken, and put markers off."""
     moments = [between(a, b, share) for a, b in itertools.pairwise(dome.direct)]

@@ -17,7 +17,9 @@ def test_the_shipped_phantom_goes_through_every_kernel() -> None:
     compile_kernels()  # raises where the shipped experiment, its pictures or its poses no longer do
 
 
-@pytest.mark.parametrize(("before", "after"), [("SCALE = 2.0", "SCALE = 5.0"), ("x + 1.0", "x + 4.0")])
+@pytest.mark.parametrize(
+    ("before", "after"), [("SCALE = 2.0", "SCALE = 5.0"), pytest.param("x + 1.0", "x + 4.0", marks=pytest.mark.slow)]
+)
 def test_a_kernel_is_compiled_again_where_another_file_changes(tmp_path: Path, before: str, after: str) -> None:
     """The kept one went on with the number and the kernel of before, whatever was installed since."""
     inner = NJIT + "SCALE = 2.0\n\n@njit(cache=True)\ndef inner(x):\n    return x + 1.0\n"

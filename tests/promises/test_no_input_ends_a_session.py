@@ -172,6 +172,7 @@ def test_a_picture_of_900_million_pixels_is_not_decoded():
 
 def _nodes(folder: Path, name: str) -> tuple[Any, dict[str, Callable[[Any], None]]]:
     """A node and what it does with the messages of its topics."""
+    from livedeform.common.ros import messages as m
     from livedeform.compare_node.node import CompareNode
     from livedeform.fem_node.node import FemNode
     from livedeform.stereo_node.node import StereoNode
@@ -189,7 +190,10 @@ def _nodes(folder: Path, name: str) -> tuple[Any, dict[str, Callable[[Any], None
         stereo.on_picture(stereo.pairs.add_left, message)
         stereo.on_picture(stereo.pairs.add_right, message)
 
-    others = {t.FEM_MARKERS: stereo.on_prediction, t.STEREO_MARKERS: stereo.on_markers}
+    def on_prediction(message: Any) -> None:
+        stereo._prior.add(m.from_predicted_markers(message))
+
+    others = {t.FEM_MARKERS: on_prediction, t.STEREO_MARKERS: stereo.on_markers}
     return stereo, {t.LEFT_IMAGE: on_pair} | others | {t.LEFT_CAMERA_INFO: partial(stereo.on_camera, "left")}
 
 

@@ -169,7 +169,7 @@ def test_markers_of_a_board_are_never_turned(kind: str, columns: int, rows: int)
                 assert np.abs(error).max() < 5e-4  # m; measured 2.8e-4
 
 
-@pytest.mark.parametrize(("columns", "rows"), [(9, 6), (6, 9)])
+@pytest.mark.parametrize(("columns", "rows"), [(9, 6), pytest.param(6, 9, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("natural", [False, True])
 def test_a_press_goes_into_the_body_however_a_board_is_numbered(columns: int, rows: int, natural: bool):
     """By -3 mm along z it was +3 mm, with level ok, of places that run to the right and up with z up: a flat pattern

@@ -16,7 +16,9 @@ from livedeform.common.bags.read import read_bag
 from livedeform.common.bags.recording import load_recording
 from livedeform.common.bags.recording_writer import RecordingWriter
 from livedeform.common.bags.write import BagWriter
+from livedeform.common.checks.probe_path import check_probe
 from livedeform.common.checks.recorded import load_checked
+from livedeform.common.experiment.plausibility import read_body
 from livedeform.common.experiment.yaml_file import Experiment, load_experiment
 from livedeform.common.types import Array, MarkerFrame, Pose, Wrench
 from livedeform.inspection import fit_findings, inspect
@@ -145,7 +147,8 @@ def cut(bag: Path, experiment: Experiment, start: float) -> list[str]:
         whole = load_recording(bag, experiment)
         played = replay.cut(whole, reader, replay.plan(reader, experiment), start, None)
         assert len(played.arrivals[t.STEREO_MARKERS]) == len(played.marker_frames)
-        found = replay.check_cut(whole, played, experiment)
+        found = [*replay.check_cut(whole, played, experiment), *check_probe(played, experiment, read_body(experiment))]
+    found = [f for f in found if f.level != "NOTE"]
     assert all(f.level == "WARN" and f.doubts for f in found)
     return [f.text for f in found]
 
@@ -161,7 +164,7 @@ def test_what_a_start_in_the_middle_leaves_out_is_doubted(name: str, tmp_path: P
     between = cut(bag, experiment, 4.5)
     assert len(between) == bool(reason) and all(reason in text and "--start 4.5 s" in text for text in between)
     within = cut(bag, experiment, 6.0)
-    assert "begins within a press (at 6 s)" in within[0] and len(within) == 1 + (name != "elastic")
+    assert "begins with the probe" in within[-1] and len(within) == 1 + (name != "elastic")
 
 
 def test_a_clock_that_was_set_before_the_start_does_not_matter(tmp_path: Path, experiment: Experiment) -> None:

@@ -35,7 +35,7 @@ NS = 1_000_000_000
 BEGINS = "begins_ns"  # in the metadata of a run: when the recording began that was run
 PICTURES = (*t.IMAGES, *t.COMPRESSED_IMAGES)
 MEASURED_TOPICS = (t.STEREO_MARKERS, t.STEREO_SURFACE, t.PROBE_POSE, t.PROBE_WRENCH, *PICTURES)
-FEW = 5  # pictures at the beginning, by whose arrival a clock is told
+FEW = 3  # pictures at the beginning, by whose arrival a clock is told
 SAME_PLACE, SAME_TURN = 1e-4, 1e-3  # m and rad: transforms further apart than that are two
 Stamps = list[tuple[int, int]]  # of one topic: header.stamp and receive time of each message, ns
 HEADED_TYPES = frozenset(
@@ -145,9 +145,9 @@ def load_recording(path: Path | str, experiment: Experiment | None = None) -> Re
         collector.finish()
         start_ns, end_ns = stamp_range(bag, collector.stamps)
         metadata = dict(bag.metadata)
-        pictures = picture_stamps(bag)
         collector.given = not any(name in bag.topics for name in PICTURES)
         arrivals = arrivals_of(bag, collector.stamps)
+        pictures = next((tuple(stamp for stamp, _ in arrivals[name]) for name in PICTURES if name in arrivals), ())
     known = None if experiment is None else experiment.markers.ids
     marker_frames = [_keep(f, known, collector) for f in collector.sorted(t.STEREO_MARKERS)]
     uncorrected = [_keep(f, known, collector) for f in collector.sorted(t.STEREO_MARKERS_RAW)]
@@ -233,17 +233,12 @@ def good_messages(known: Stamps) -> Stamps:
     return [pair for pair, wrong in zip(known, bad, strict=True) if not wrong]
 
 
-def picture_stamps(bag: BagReader) -> tuple[int, ...]:
-    """Stamps of the first left picture and of those of the last second; empty without pictures."""
-    name = picture_topic(bag, t.LEFT_IMAGE)
-    return tuple(good_stamps(header_stamps(ends(bag, name)))) if name is not None else ()
-
-
 def arrivals_of(bag: BagReader, known: Mapping[str, Stamps]) -> dict[str, Stamps]:
     """Return by topic the good stamps of what was measured, and when these messages came. Markers that are found in
-    pictures came as late as that took, and tell nothing of a clock; pictures are read at both ends."""
-    filmed = [name for name in PICTURES if name in bag.topics]
-    pairs = {name: header_stamps(ends(bag, name, FEW)) for name in filmed}
+    pictures came as late as that took, and tell nothing of a clock; pictures are read at both ends, of the left camera.
+    """
+    left, filmed = picture_topic(bag, t.LEFT_IMAGE), any(name in bag.topics for name in PICTURES)
+    pairs = {} if left is None else {left: header_stamps(ends(bag, left, FEW))}
     pairs |= {name: known[name] for name in (t.PROBE_POSE, *(() if filmed else (t.STEREO_MARKERS,)))}
     return {name: each for name, all_of_it in pairs.items() if (each := good_messages(all_of_it))}
 
