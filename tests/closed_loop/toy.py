@@ -9,6 +9,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from scipy.signal import lfilter
 
+from livedeform.closed_loop.assessment.held_out import RecordingErrors
 from livedeform.closed_loop.candidates import Candidate, catalogue
 from livedeform.closed_loop.evidence.noise import ModelErrors
 from livedeform.closed_loop.evidence.observation import Observation, observe, poses_at
@@ -283,3 +284,22 @@ __all__ = [
     "surroundings",
     "uncertain",
 ]
+
+
+def recording_errors(
+    measured: Array,
+    predicted: Array,
+    covariances: Array,
+    weights: Array,
+    presses: np.ndarray,
+    *,
+    name: str = "b",
+    blocks: np.ndarray | None = None,
+) -> RecordingErrors:
+    """What a model leaves of one recording: points (k, m, 3) m with covariances, moments that stand for ``weights``
+    (k,) s in ``presses`` (k,), each moment or as said a block of its own."""
+    k, m, _ = measured.shape
+    own = np.arange(k) if blocks is None else blocks
+    return RecordingErrors(
+        name, 0, np.arange(k), np.arange(m), measured, predicted, covariances, weights, own, presses
+    )  # fmt: skip

@@ -33,7 +33,7 @@ class StereoNode(CountingNode):
         self.pairs = settings.picture_pairs()
         self.tracker: StereoTracker | None = None
         self._rest = settings.rest()
-        self.correction = settings.correction(self.experiment)
+        self.correction = settings.correction(self.experiment, self._rest)
         self._cameras: dict[str, CameraCalibration] = {}
         self._prior = settings.prior(self.experiment.markers.ids)
         self._markers = self.publisher(PointCloud2, t.STEREO_MARKERS)

@@ -53,10 +53,10 @@ class StereoParameters:
         """Return the markers at rest (n, 3) m; None where they are as the experiment declares them."""
         return read_markers(Path(self.rest_markers)).points if self.rest_markers else None
 
-    def correction(self, experiment: Experiment) -> MeasuringCorrection:
-        """Return what takes the experiment's measuring effects out."""
+    def correction(self, experiment: Experiment, rest: Array | None) -> MeasuringCorrection:
+        """Return what takes the experiment's measuring effects out of markers that are at ``rest`` (n, 3) m."""
         wait = 0.0 if experiment.probe is None else self.surface_wait
-        return MeasuringCorrection(experiment, self.start_ns, parse_pose(self.camera_pose), self.rest(), wait)
+        return MeasuringCorrection(experiment, self.start_ns, parse_pose(self.camera_pose), rest, wait)
 
     def prior(self, ids: Ids) -> ModelPrior:
         """Return what keeps the predictions of the markers ``ids``."""

@@ -8,7 +8,7 @@ import toy
 from toy_loop import PLACES, toy_inputs
 
 from livedeform.closed_loop.assessment.called_for import Called, called_for, moved_in_noise
-from livedeform.closed_loop.assessment.held_out import HeldOutErrors, RecordingErrors
+from livedeform.closed_loop.assessment.held_out import HeldOutErrors
 from livedeform.closed_loop.diagnosis import Diagnosis
 from livedeform.closed_loop.evidence.noise import Covariance, Nuisance, rows_of
 from livedeform.closed_loop.inference.gauss_newton import Problem
@@ -96,23 +96,8 @@ def errors(predicted: Array, sigma: Array) -> HeldOutErrors:
     measured = np.full_like(predicted, FRAME)
     measured[0, 1] = np.nan
     covariances = np.broadcast_to(np.diag(sigma**2), (k, m, 3, 3))
-    weights = np.linspace(1.0, 2.0, k)
-    return HeldOutErrors(
-        (
-            RecordingErrors(
-                "b",
-                0,
-                np.arange(k),
-                np.arange(m),
-                measured,
-                predicted,
-                covariances,
-                weights,
-                np.arange(k),
-                np.arange(k) + 1,
-            ),
-        )
-    )
+    weights, presses = np.linspace(1.0, 2.0, k), np.arange(k) + 1
+    return HeldOutErrors((toy.recording_errors(measured, predicted, covariances, weights, presses),))
 
 
 @pytest.mark.parametrize(("axis", "matters"), [(0, True), (2, False)])

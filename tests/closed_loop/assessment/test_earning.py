@@ -14,7 +14,7 @@ from toy_loop import PLACES, closed, toy_inputs
 
 from livedeform.closed_loop.assessment.called_for import Called
 from livedeform.closed_loop.assessment.earning import Earned, Earning, Fall, Predicted, fall, force_fall, left_out
-from livedeform.closed_loop.assessment.held_out import HeldOutErrors, RecordingErrors
+from livedeform.closed_loop.assessment.held_out import HeldOutErrors
 from livedeform.closed_loop.borne_out import HeldOutRuns, earning, may_be_nothing, more_than_nothing, refitted_without
 from livedeform.closed_loop.evidence.observation import Observation
 from livedeform.closed_loop.forward import ForwardModel, Run
@@ -77,18 +77,8 @@ def errors(
 ) -> HeldOutErrors:
     k, m, _ = measured.shape
     covariances = np.broadcast_to(np.eye(3) * sigma**2, (k, m, 3, 3))
-    one = RecordingErrors(
-        "b",
-        0,
-        np.arange(k),
-        np.arange(m),
-        measured,
-        predicted,
-        covariances,
-        np.linspace(1.0, 2.0, k),
-        blocks,
-        blocks + 1,
-    )
+    weights = np.linspace(1.0, 2.0, k)
+    one = toy.recording_errors(measured, predicted, covariances, weights, blocks + 1, blocks=blocks)
     return HeldOutErrors((one,))
 
 

@@ -22,8 +22,7 @@ from livedeform.closed_loop.loop import investigate
 def _errors(name: str, size: float) -> RecordingErrors:
     measured = np.full((4, 5, 3), size / np.sqrt(3.0))
     nothing = np.zeros((4, 5, 3, 3))
-    return RecordingErrors(name, 0, np.arange(4), np.arange(5), measured, 0.0 * measured, nothing, np.ones(4),
-                           np.arange(4), np.ones(4, int))  # fmt: skip
+    return toy.recording_errors(measured, 0.0 * measured, nothing, np.ones(4), np.ones(4, int), name=name)
 
 
 def test_the_next_recording_is_expected_from_how_recordings_differ():
@@ -40,9 +39,7 @@ def _presses(before: np.ndarray, after: np.ndarray, presses: np.ndarray) -> tupl
     """Errors (k, m, 3) m before and after in ``presses`` (k,)."""
     k, m, _ = before.shape
     zero, certain = np.zeros_like(before), np.zeros((k, m, 3, 3))
-    rest = np.arange(k), np.arange(m)
-    said = (np.ones(k), np.arange(k), presses)
-    one, other = (RecordingErrors("a", 0, *rest, e, zero, certain, *said) for e in (before, after))
+    one, other = (toy.recording_errors(e, zero, certain, np.ones(k), presses) for e in (before, after))
     return HeldOutErrors((one,)), HeldOutErrors((other,))
 
 

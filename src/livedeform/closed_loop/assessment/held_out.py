@@ -16,7 +16,7 @@ from livedeform.common.checks.presses import shows_the_body
 from livedeform.common.types import Array
 from livedeform.compare_node import metrics
 from livedeform.compare_node.coverage import Coverage
-from livedeform.compare_node.takes import Expected, expected
+from livedeform.compare_node.takes import HIGH, Expected, expected
 
 LEAST_SIGMA = 1e-9  # m
 TINY = float(np.finfo(float).tiny)
@@ -243,6 +243,6 @@ def improvement_interval(before: HeldOutErrors, after: HeldOutErrors) -> tuple[f
     variances = [len(v) / max(len(v) - 1, 1) * float((v**2).sum()) for v in (by_press, by_marker)]
     freedom = [max(len(v) - 1, 1) for v in (by_press, by_marker)]
     nu = sum(variances) ** 2 / max(sum(v**2 / n for v, n in zip(variances, freedom, strict=True)), TINY)
-    half = float(stdtrit(max(nu, 1.0), 0.975)) * np.sqrt(sum(variances))
+    half = float(stdtrit(max(nu, 1.0), HIGH)) * np.sqrt(sum(variances))
     ratio = np.sqrt(total[1] / total[0])
     return float(1.0 - ratio * np.exp(half)), float(1.0 - ratio * np.exp(-half))

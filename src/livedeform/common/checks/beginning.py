@@ -27,7 +27,7 @@ def check_beginning(recording: Recording, experiment: Experiment, body: Surface)
         return []
     path = probe_path(recording.poses, experiment.probe.shape, body, recording.start_ns)
     limit = clear_limit(recording, experiment, body)
-    surely = begins_inside(recording, experiment, body)
+    surely = _surely_inside(path, experiment, body)
     if surely or not (_as_deep_as_later(path) or _force_shows(recording, path, float(path.seconds[0]), limit)):
         return []
     return [_within_a_press(float(path.seconds[0]))]
@@ -38,6 +38,10 @@ def begins_inside(recording: Recording, experiment: Experiment, body: Surface) -
     if experiment.probe is None or not recording.poses:
         return False
     path = probe_path(recording.poses, experiment.probe.shape, body, recording.start_ns)
+    return _surely_inside(path, experiment, body)
+
+
+def _surely_inside(path: ProbeApproach, experiment: Experiment, body: Surface) -> bool:
     return float(path.depths[0]) > TOUCH + sag_bound(experiment, body)
 
 
