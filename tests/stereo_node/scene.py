@@ -252,10 +252,11 @@ def tag_picture(seed: int, family: str = "DICT_APRILTAG_36h11", noise: float = 2
     rng, scale, (w, h) = np.random.default_rng(seed), 4, (800, 600)
     dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, family))
     big, truth = np.full((h * scale, w * scale), 200.0, np.float32), {}
-    corners = np.array([[-0.5, -0.5], [199.5, -0.5], [199.5, 199.5], [-0.5, 199.5]], np.float32)
+    # 168 is a multiple of either family's modules: OpenCV draws others as of different size
+    corners = np.array([[-0.5, -0.5], [209.5, -0.5], [209.5, 209.5], [-0.5, 209.5]], np.float32)
     for code in range(12):
-        flat = np.full((200, 200), 200.0, np.float32)
-        flat[20:180, 20:180] = np.where(cv2.aruco.generateImageMarker(dictionary, code, 160) > 0, 200.0, 30.0)
+        flat = np.full((210, 210), 200.0, np.float32)
+        flat[21:189, 21:189] = np.where(cv2.aruco.generateImageMarker(dictionary, code, 168) > 0, 200.0, 30.0)
         centre = np.array([110 + 190 * (code % 4), 110 + 190 * (code // 4)]) + rng.uniform(-20, 20, 2)
         turn = rng.uniform(0, 2 * np.pi)
         R = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
@@ -264,7 +265,7 @@ def tag_picture(seed: int, family: str = "DICT_APRILTAG_36h11", noise: float = 2
         M = cv2.getPerspectiveTransform(corners, ((quad + 0.5) * scale - 0.5).astype(np.float32))
         warped = cv2.warpPerspective(flat, M, (w * scale, h * scale), flags=cv2.INTER_LINEAR, borderValue=-1)
         big = np.where(warped >= 0, warped, big)
-        middle = M @ np.array([99.5, 99.5, 1.0])
+        middle = M @ np.array([104.5, 104.5, 1.0])
         truth[code] = (middle[:2] / middle[2] + 0.5) / scale - 0.5
     picture = cv2.GaussianBlur(cv2.resize(big, (w, h), interpolation=cv2.INTER_AREA), (0, 0), 0.6)
     return np.clip(np.round(picture + rng.normal(0, noise, picture.shape)), 0, 255).astype(np.uint8), truth

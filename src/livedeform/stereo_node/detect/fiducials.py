@@ -14,14 +14,15 @@ from typing import Any
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from livedeform.common.errors import InputError
 from livedeform.common.types import Array
 from livedeform.stereo_node.boards.boards import Board, BoardView, find_board, rows_alike
 from livedeform.stereo_node.detect.blobs import Blobs, detect_blobs
-from livedeform.stereo_node.detect.picture import Picture
+from livedeform.stereo_node.detect.picture import Picture, noise_level
 from livedeform.stereo_node.detect.settings import DetectorSettings
-from livedeform.stereo_node.detect.tag_fit import tag_middles
+from livedeform.stereo_node.detect.tags.fit import tag_middles
 
 DEFAULT_DICTIONARY = {"aruco": "DICT_4X4_250", "apriltag": "DICT_APRILTAG_36h11"}
 BOARDS = {"circle_grid": "circles", "checkerboard": "checkerboard"}
@@ -34,7 +35,8 @@ def detect_markers(picture: Picture, settings: DetectorSettings, noise: float | 
     if settings.type == "blob":
         return detect_blobs(picture, settings, noise)
     if settings.type in DEFAULT_DICTIONARY:
-        return _tags(picture, settings.dictionary or DEFAULT_DICTIONARY[settings.type])
+        noise = noise_level(picture) if noise is None else noise
+        return _tags(picture, settings.dictionary or DEFAULT_DICTIONARY[settings.type], noise)
     return _board_points(picture, settings)
 
 
@@ -52,7 +54,7 @@ def _tag_detector(dictionary: str) -> Any:
     return cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, dictionary)), parameters)
 
 
-def _tags(picture: Picture, dictionary: str) -> Blobs:
+def _tags(picture: Picture, dictionary: str, noise: float) -> Blobs:
     corners, ids, _ = _tag_detector(dictionary).detectMarkers(picture)
     if ids is None or not len(ids):
         return _coded(np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros(0), np.zeros(0, np.int64))
@@ -60,12 +62,18 @@ def _tags(picture: Picture, dictionary: str) -> Blobs:
     names, counts = np.unique(ids.ravel(), return_counts=True)
     once = np.isin(ids.ravel(), names[counts == 1])  # a code that is there twice says nothing
     quads, codes = quads[once], ids.ravel()[once].astype(np.int64)
-    modules = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, dictionary)).markerSize + 2
-    centres, covariances = tag_middles(picture, quads, modules)
+    centres, covariances = tag_middles(picture, quads, _modules(dictionary, codes), noise)
     seen = np.isfinite(centres[:, 0])
     quads, codes, centres, covariances = quads[seen], codes[seen], centres[seen], covariances[seen]
     size = np.linalg.norm(quads - np.roll(quads, 1, axis=1), axis=2).mean(axis=1) / 2
     return _coded(centres, covariances, size, codes)
+
+
+def _modules(dictionary: str, codes: NDArray[np.int64]) -> Array:
+    """Return the modules (n, m, m) of the tags ``codes`` (n,) with their border, 1 white and 0 black."""
+    known = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, dictionary))
+    m = known.markerSize + 2
+    return np.array([known.generateImageMarker(int(code), m) > 0 for code in codes], float).reshape(-1, m, m)
 
 
 def counted_as_left(left: Blobs, right: Blobs, settings: DetectorSettings) -> Blobs:

@@ -1,0 +1,1 @@
+"""Square tags: their middles by the picture of their whole code."""
