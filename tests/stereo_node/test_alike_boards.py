@@ -224,17 +224,41 @@ def test_flat_dots_that_are_their_own_mirror_image_are_known_by_the_side():
     np.testing.assert_array_equal(found.marker_rows[np.argsort(found.point_rows)], np.arange(7))
 
 
+def block(width: float, thick: float) -> Surface:
+    """A block from the origin on, ``width`` m along x and y and ``thick`` m along z."""
+    corners = np.array([[x, y, z] for x in (0, width) for y in (0, width) for z in (0, thick)])
+    faces = [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]]
+    return Surface(corners, np.array([t for a, b, c, d in faces for t in ((a, b, c), (a, c, d))]))
+
+
 @pytest.mark.parametrize("thick", [0.002, 0.05])
 def test_the_bodys_surface_tells_its_side(thick: float):
-    corners = np.array([[x, y, z] for x in (0, 0.1) for y in (0, 0.1) for z in (0, thick)])
-    faces = [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]]
-    body = Surface(corners, np.array([t for a, b, c, d in faces for t in ((a, b, c), (a, c, d))]))
+    body = block(0.1, thick)
     assert np.isclose(body.volume, 0.01 * thick)  # outward
     x, y = np.meshgrid([0.02, 0.05, 0.08], [0.02, 0.05, 0.08])
     for z, out in ((thick + 3e-4, 1.0), (thick - 3e-4, 1.0), (2e-4, -1.0)):  # declared beside the surface
         side = outward_side(body, np.column_stack([x.ravel(), y.ravel(), np.full(9, z)]))
         np.testing.assert_allclose(side, out * UP, atol=1e-9)
     assert outward_side(body, np.column_stack([x.ravel() + 0.3, y.ravel(), np.full(9, thick)])) is None
+
+
+@pytest.mark.parametrize(("width", "off"), [(0.06, 0.0032), (0.1, 0.00635), (0.06, 0.02)])
+def test_the_side_of_balls_and_pins_that_stand_off_the_body_is_known(width: float, off: float):
+    """Their middles lie farther from the surface than a part of the body's size."""
+    body = block(width, 0.05)
+    x, y = (a.ravel() for a in np.meshgrid(width * np.linspace(0.05, 0.95, 5), width * np.linspace(0.05, 0.95, 5)))
+    for z, out in ((0.05 + off, 1.0), (-off, -1.0)):
+        np.testing.assert_allclose(outward_side(body, np.column_stack([x, y, np.full(25, z)])), out * UP, atol=1e-9)
+
+
+def test_the_side_of_beads_amid_the_body_is_not_known_nor_that_of_markers_beside_it():
+    """Cameras may see either through it: nothing is guessed."""
+    body = block(0.06, 0.05)
+    x, y = (a.ravel() for a in np.meshgrid(np.linspace(0.01, 0.05, 5), np.linspace(0.01, 0.05, 5)))
+    for z in (0.025, 0.03, 0.015):
+        assert outward_side(body, np.column_stack([x, y, np.full(25, z)])) is None
+    for z in (0.0, 0.03, 0.05):  # on the table, on a stand
+        assert outward_side(body, np.column_stack([x + 0.1, y, np.full(25, z)])) is None
 
 
 @pytest.mark.parametrize("off", [0.008, 0.02])

@@ -6,7 +6,7 @@ from press import simulate_press, spots
 from scene import dome_markers, looking_down, make_test_rig
 
 from livedeform.common.frames import apply, inverse
-from livedeform.stereo_node.track.identities import IdentityTracker, TrackSettings
+from livedeform.stereo_node.track.identities import MAY_BE_NEIGHBOURS, IdentityTracker, TrackSettings
 from livedeform.stereo_node.track.match import MatchSettings, candidate_pairs
 
 
@@ -98,6 +98,77 @@ def grid(n_x=9, n_y=7, spacing=0.008):
     return points, IdentityTracker(apply(inverse(looking_down()), points), seen, TrackSettings(), 1e-3)
 
 
+def through_a_slow_press(rate, n_dots, drag=0.0, speed=0.006, pause=0.0):
+    """A bar comes down on a grid, presses 6 mm deep and drags it by ``drag`` m, with ``n_dots`` bright dots on it; it
+    hides the markers below, and after it came in no pictures come for ``pause`` s. How many ids are wrong, the share of
+    the markers in view that is published meanwhile, and the frames that are refused."""
+    points, tracker = grid()
+    rig, T, rng = make_test_rig(), looking_down(), np.random.default_rng(0)
+    dots = 1e-3 * np.array([[-9, 1, 36], [0, 1.5, 36], [10, -1, 36], [4, -3, 36], [-5, 3, 36], [7, 2, 36]])[:n_dots]
+    bump = np.exp(-(points[:, :2] ** 2).sum(axis=1) / (2 * 0.02**2))[:, None]
+    covered = (np.abs(points[:, 0]) < 0.012) & (np.abs(points[:, 1]) < 0.006)
+    wrong, refused, share = 0, 0, []
+    begin = max(0.5, 3 / rate)  # s
+    for time in np.arange(0, begin + 3, 1 / rate):
+        if begin - 0.05 < time < begin + pause - 0.05:
+            continue
+        depth = np.clip(speed * (time - begin - 0.3), 0, 0.006)
+        moved = points + bump * np.array([drag * depth / 0.006, 0.0, -depth])
+        there = time >= begin
+        in_view = np.vstack([moved[~covered], dots - [0, 0, depth]]) if there else moved
+        faces = np.ones(len(in_view), bool)
+        pictures = (spots(rig, apply(inverse(T), in_view), faces, rng, right=side) for side in (False, True))
+        pairs = candidate_pairs(rig, *pictures, MatchSettings())
+        result = tracker.update(round(time * 1e9) + 1, pairs)
+        rows, names = result.pairs[result.confirmed], result.markers[result.confirmed]
+        off = np.linalg.norm(apply(T, pairs.points.points[rows]) - moved[names], axis=1)
+        wrong += int((off > 1.5e-3).sum())
+        refused += MAY_BE_NEIGHBOURS in result.rejected
+        if there:
+            share.append(len(names) / (~covered).sum())
+    return wrong, np.mean(share), refused
+
+
+@pytest.mark.parametrize(
+    ("rate", "n_dots", "more"),
+    [
+        (10, 3, {"pause": 0.4}),
+        (30, 5, {"pause": 0.4}),
+        (5, 6, {}),
+        (3, 3, {}),
+        (1, 5, {}),
+        (3, 1, {"drag": 0.004, "speed": 0.01}),
+    ],
+)
+def test_a_probe_with_dots_on_it_costs_no_press(rate, n_dots, more):
+    """After a pause, or with slow cameras, its dots are new as soon as markers are hidden: no chain of markers leads
+    from the ones to the others. All of the press was refused where that was not asked for."""
+    wrong, share, refused = through_a_slow_press(rate, n_dots, **more)
+    assert wrong == 0 and refused == 0
+    assert share > 0.95
+
+
+@pytest.mark.parametrize("seconds", [0.1, 0.2])
+@pytest.mark.parametrize("share", [0.7, 1.3])
+def test_a_drag_in_a_short_pause_takes_no_neighbours_ids(share, seconds):
+    """One lost picture at 10 Hz is enough: what may have happened meanwhile counts, and not how long that was."""
+    points, tracker = grid()
+    wrong, seen = through_a_pause(points, share * np.array([0.008, 0.0, 0.0]), tracker, "at rest", 0.04, seconds)
+    assert sum(wrong) == 0 and seen[-1] == 1.0
+
+
+@pytest.mark.parametrize(("size", "hidden"), [((25, 1), []), ((25, 2), []), ((25, 2), [12, 37]), ((9, 7), [30, 31])])
+def test_a_pattern_that_moved_by_its_spacing_as_a_whole_takes_no_neighbours_ids(size, hidden):
+    """Only at its ends can that be seen, and a hidden marker breaks the rows off."""
+    points, _ = grid(*size)
+    points = np.delete(points, hidden, axis=0)
+    tracker = IdentityTracker(
+        apply(inverse(looking_down()), points), np.ones(len(points), bool), TrackSettings(), start_sigma=1e-3
+    )
+    wrong, seen = through_a_pause(points, np.array([0.008, 0.0, 0.0]), tracker, "at rest", width=10.0)
+    assert sum(wrong) == 0 and seen[5] == 0.0 and seen[-1] == 1.0
+
+
 @pytest.mark.parametrize("width", [0.015, 0.04])
 @pytest.mark.parametrize("share", [0.3, 0.7, 1.0, 1.3])
 def test_a_grid_that_is_dragged_while_pictures_pause_takes_no_neighbours_ids(share, width):
@@ -114,6 +185,29 @@ def test_after_a_pause_that_began_in_a_press_the_body_may_be_at_rest():
     wrong, seen = through_a_pause(points, np.array([0.007, 0.0, 0.0]), tracker, "in a press")
     assert sum(wrong) == 0 and seen[29] == 1.0
     assert seen[-1] == 1.0
+
+
+@pytest.mark.parametrize("size", [(9, 7), (12, 1)])
+@pytest.mark.parametrize("n_dots", [0, 3])
+def test_a_hand_that_hides_all_markers_costs_none_of_them(size, n_dots):
+    """It sweeps over the body for a second, with bright dots on it. From a grid of 8 mm none came back, ever: each
+    might have been its neighbour."""
+    points, tracker = grid(*size)
+    rig, T, rng = make_test_rig(), looking_down(), np.random.default_rng(0)
+    dots = np.array([[-0.015, 0.001, 0.04], [0.01, 0.002, 0.045], [0.02, -0.01, 0.05]])[:n_dots]
+    for k in range(28):
+        front, rear = 0.02 * (k - 5), 0.02 * (k - 17)  # m: it goes along x
+        hidden = (points[:, 0] > rear - 0.1) & (points[:, 0] < front - 0.1)
+        shown = np.vstack([points[~hidden], dots if hidden.any() else dots[:0]])
+        faces = np.ones(len(shown), bool)
+        pictures = (spots(rig, apply(inverse(T), shown), faces, rng, right=side) for side in (False, True))
+        pairs = candidate_pairs(rig, *pictures, MatchSettings())
+        result = tracker.update(k * 10**8 + 1, pairs)
+        rows, names = result.pairs[result.confirmed], result.markers[result.confirmed]
+        assert np.linalg.norm(apply(T, pairs.points.points[rows]) - points[names], axis=1).max(initial=0.0) < 1.5e-3
+        if hidden.all():
+            assert not len(names)
+    assert len(names) > 0.95 * len(points)
 
 
 def test_a_glint_and_hidden_markers_cost_nothing_after_a_pause():

@@ -31,7 +31,7 @@ from livedeform.stereo_node.detect.settings import DetectorSettings
 from livedeform.stereo_node.discs.centres import DiscCorrection
 from livedeform.stereo_node.picture_checks import WHERE, BadPictures, PictureChecks
 from livedeform.stereo_node.status import FrameStatus, total_counts
-from livedeform.stereo_node.track.identities import AFTER_A_PAUSE, IdentityTracker, Tracked, TrackSettings
+from livedeform.stereo_node.track.identities import MAY_BE_NEIGHBOURS, IdentityTracker, Tracked, TrackSettings
 from livedeform.stereo_node.track.match import MatchSettings, Pairs, candidate_pairs
 from livedeform.stereo_node.track.register import MIN_MARKERS, Registration, refine
 from livedeform.stereo_node.track.sides import nearly_flat, outward_side
@@ -322,8 +322,8 @@ class StereoTracker:
         n_matched = len(np.unique(pairs.left))
         rms = float(np.sqrt((epipolar**2).mean())) if len(measured) else float("nan")
         level, message = self._verdict(len(measured), rms, n_matched, self._beside_rest(measured))
-        if AFTER_A_PAUSE in tracked.rejected:
-            what = "markers moved by as much as they are apart while no pictures came"
+        if MAY_BE_NEIGHBOURS in tracked.rejected:
+            what = "markers may have moved to their neighbours' places since the pictures before"
             level, message = "error", f"{what}; waiting until the body is as before, or at rest"
         known = self._uncertainty_of_calibration(measured)
         return FrameStatus(

@@ -4,9 +4,9 @@ Every marker is predicted: where it was, carried on by its velocity while it is 
 neighbours' displacement while it is not (the body is continuous, so the displacement field is smooth). Markers that
 were just seen take their points first, by one global assignment; what they leave may belong to markers that come
 back. A returning marker is taken only when no other marker explains the point nearly as well, and it is published
-from its second sighting on. A doubt costs a marker for some frames; it never swaps two. After a pause between the
-pictures a whole patch may have moved to its neighbours' places: then points are left over in front of it and markers
-behind, and nothing is published until the body is again as it was before the pause, or at rest.
+from its second sighting on. A doubt costs a marker for some frames; it never swaps two. Between two pictures a whole
+patch may have moved to its neighbours' places: where that explains more of the markers, nothing is published until the
+body is again as it was before, or at rest.
 """
 
 from __future__ import annotations
@@ -19,10 +19,11 @@ from numpy.typing import NDArray
 
 from livedeform.common.types import Array
 from livedeform.stereo_node.track.match import Pairs, assign
+from livedeform.stereo_node.track.shifts import filled, shifted
 
 Rows = NDArray[np.int64]
 MIN_NEIGHBOURS = 8
-AFTER_A_PAUSE = "identity in doubt after a pause"  # why none of these is published
+MAY_BE_NEIGHBOURS = "may be its neighbour"  # why none of these is published
 
 
 @dataclass(frozen=True)
@@ -42,8 +43,6 @@ class TrackSettings:
     confirm: int = 2  # sightings before a returning marker is published
     forgive: int = 2  # frames in a row that a marker may be missed without having to be confirmed again
     forget_seconds: float = 0.3  # after which a velocity says nothing any more
-    moved_share: float = 0.25  # of the distance to the next marker, beyond which it may have moved to the next's place
-    row: int = 3  # markers that a patch leaves behind, whatever they moved
 
 
 @dataclass(frozen=True)
@@ -77,7 +76,7 @@ class IdentityTracker:
         self.ever_seen = seen.copy()
         self.stamp_ns: int | None = None
         self._n_by_model = 0
-        self._left_over = np.zeros((0, 3))  # points of the last frame that are no marker's
+        self._in_doubt = False
         distance = np.linalg.norm(rest[:, None] - rest[None], axis=2)
         np.fill_diagonal(distance, np.inf)
         self.spacing = distance.min(axis=1) if len(rest) > 1 else np.full(len(rest), np.inf)
@@ -147,10 +146,8 @@ class IdentityTracker:
         k = self._kernel[np.ix_(lost, fresh)]
         weights = np.linalg.solve(K, k.T).T
         left_over = np.maximum(1 - (weights * k).sum(axis=1), 0.0)
-        # the field's size from the data themselves (their quadratic form), per axis
-        rest = displacement - mean
-        size = float(np.sqrt((rest * np.linalg.solve(K, rest)).sum() / (3 * len(rest))))
-        return base[lost] + mean + weights @ rest, size * np.sqrt(left_over), size
+        size = self._size(np.flatnonzero(fresh), displacement)
+        return base[lost] + mean + weights @ (displacement - mean), size * np.sqrt(left_over), size
 
     def update(
         self, stamp_ns: int, pairs: Pairs, model: Array | None = None, names: NDArray[np.int64] | None = None
@@ -165,15 +162,19 @@ class IdentityTracker:
         for position, sigma in self._expected(stamp_ns, model):
             markers, rows, doubtful = self._assign(pairs, position, sigma)
             smooth = self._smooth(pairs, markers, rows, position)
-            points, untouched = pairs.points.points, _untouched(pairs, rows[smooth])
-            if not self._moved_on(stamp_ns, markers[smooth], points[rows[smooth]], position, points[untouched]):
+            # a doubt lasts until most are found again; where all are hidden, no picture came
+            few = 2 * smooth.sum() < self.fresh.sum() if self._in_doubt else not smooth.any() and self.fresh.any()
+            self._in_doubt = bool(few) or self._may_be_neighbours(stamp_ns, pairs, markers, rows, position)
+            if not self._in_doubt:
                 break
         else:
             nobody = np.zeros(0, np.int64)
-            return Tracked(nobody, nobody, np.zeros(0, bool), {AFTER_A_PAUSE: len(markers)})
-        n_by_model, self._left_over = self._n_by_model, points[untouched]
+            rejected = {MAY_BE_NEIGHBOURS: len(markers), "no marker there": len(np.unique(pairs.left)) - len(markers)}
+            return Tracked(nobody, nobody, np.zeros(0, bool), {k: v for k, v in rejected.items() if v > 0})
+        n_by_model, untouched = self._n_by_model, _untouched(pairs, rows[smooth])
+        self._learn_rest(markers, pairs.points.points[rows] - position[markers])
         markers, rows = markers[smooth], rows[smooth]
-        self._advance(stamp_ns, markers, points[rows])
+        self._advance(stamp_ns, markers, pairs.points.points[rows])
         # at first nothing went before that could be mistaken
         confirmed = (self.sightings[markers] >= self.settings.confirm) | first
         rejected = {
@@ -185,33 +186,48 @@ class IdentityTracker:
         return Tracked(markers, rows, confirmed, {k: v for k, v in rejected.items() if v}, n_by_model)
 
     def _expected(self, stamp_ns: int, model: Array | None) -> Iterator[tuple[Array, Array]]:
-        """Yield where markers (m, 3) may be, and the sigmas (m,) of that: after a pause the body may be at rest."""
+        """Yield where markers (m, 3) may be, and the sigmas (m,) of that: as predicted, or else at rest again."""
         position, sigma = self.predict(stamp_ns, model)
         yield position, sigma
-        if self._paused(stamp_ns):
-            yield self.rest, sigma
+        yield self.rest, sigma
 
-    def _paused(self, stamp_ns: int) -> bool:
-        """Tell whether the last picture is so long ago that markers may be anywhere."""
-        return self.stamp_ns is not None and (stamp_ns - self.stamp_ns) * 1e-9 > self.settings.forget_seconds
-
-    def _moved_on(self, stamp_ns: int, markers: Rows, points: Array, position: Array, left_over: Array) -> bool:
-        """Tell whether, after a pause, the ``points`` (n, 3) of ``markers`` (n,) may be their neighbours': new points
-        are ``left_over`` (k, 3) among them and markers are missing, which lost ones do not account for.
-
-        A patch that moved by more than half its spacing is found one marker further, but for its front and rear.
-        """
-        s, fresh = self.settings, self.fresh
-        if not self._paused(stamp_ns) or not fresh.any():
+    def _may_be_neighbours(self, stamp_ns: int, pairs: Pairs, markers: Rows, rows: Rows, position: Array) -> bool:
+        """Tell whether the ``rows`` (n,) of ``pairs`` may be those of the neighbours of ``markers`` (n,): as such, more
+        markers are seen that move with their neighbours, and the body is not bent distinctly more by that.
+        ``position`` (m, 3) m: where all are expected."""
+        if self.stamp_ns is None:
             return False
-        missing = fresh & ~np.isin(np.arange(len(fresh)), markers)
-        spacing = float(np.median(self.spacing[fresh]))
-        near = _nearest(left_over, position[fresh]) < 1.5 * spacing
-        seen_before = _nearest(left_over, np.vstack([self._left_over, position[~fresh]])) < 0.5 * spacing
-        n_new = int((near & ~seen_before).sum())
-        moved = np.linalg.norm(points - position[markers], axis=1) > s.moved_share * self.spacing[markers]
-        n = min(int(missing.sum()), n_new)
-        return n >= s.row or (n > 0 and bool((moved & fresh[markers]).any()))
+        s, dt = self.settings, max((stamp_ns - self.stamp_ns) * 1e-9, 0.0)
+        row_of = np.full(len(position), -1)
+        row_of[markers] = rows
+        # what is in doubt as a marker that comes back is in its place all the same
+        row_of = filled(row_of, position, self.spacing, np.flatnonzero(_untouched(pairs, rows)), pairs)
+        together, size = self._moving_together(pairs, row_of, position)
+        free = np.flatnonzero(_untouched(pairs, row_of[row_of >= 0]))
+        reach = s.gate * (s.jitter + s.speed_change * dt) + 0.5 * float(np.median(self.spacing))
+        for other in shifted(position, self.spacing, row_of, free, pairs, reach):
+            as_well, other_size = self._moving_together(pairs, other, position)
+            if as_well.sum() > together.sum() and other_size**2 < s.distinct * (size**2 + s.jitter**2):
+                return True
+        return False
+
+    def _moving_together(self, pairs: Pairs, row_of: Rows, position: Array) -> tuple[NDArray[np.bool_], float]:
+        """Tell which markers (m,) move with their neighbours if the rows ``row_of`` (m,) of ``pairs`` are theirs, -1
+        for none, and the size (m) of the field by which all of them moved from ``position`` (m, 3) m."""
+        named = np.flatnonzero((row_of >= 0) & self.ever_seen)
+        surprise = pairs.points.points[row_of[named]] - position[named]
+        together = np.zeros(len(row_of), bool)
+        together[named] = self._moves_with_neighbours(named, surprise, pairs.points.covariances[row_of[named]])
+        return together, self._size(named, surprise)
+
+    def _size(self, markers: Rows, moved: Array) -> float:
+        """Return the size (m) of the smooth field that ``moved`` the markers (n,) by (n, 3) m, beside their mean."""
+        if len(markers) == 0:
+            return 0.0
+        K = self._kernel[np.ix_(markers, markers)] + 1e-3 * np.eye(len(markers))
+        rest = moved - moved.mean(axis=0)
+        # from the data themselves (their quadratic form), per axis
+        return float(np.sqrt((rest * np.linalg.solve(K, rest)).sum() / (3 * len(rest))))
 
     def _update_named(self, stamp_ns: int, pairs: Pairs, names: Rows) -> Tracked:
         rows = np.flatnonzero(names >= 0)
@@ -234,14 +250,18 @@ class IdentityTracker:
         return np.concatenate([markers, back_markers]), np.concatenate([rows, back_rows]), doubtful
 
     def _smooth(self, pairs: Pairs, markers: Rows, rows: Rows, position: Array) -> NDArray[np.bool_]:
-        """Tell which (n,) move with their neighbours; the rest of a marker never seen before is put where it is."""
+        """Tell which (n,) move with their neighbours, or were never seen before."""
         surprise = pairs.points.points[rows] - position[markers]
         known = self.ever_seen[markers]
         smooth = np.ones(len(markers), bool)
         covariances = pairs.points.covariances[rows[known]]
         smooth[known] = self._moves_with_neighbours(markers[known], surprise[known], covariances)
-        self.rest[markers[~known]] += surprise[~known]
         return smooth
+
+    def _learn_rest(self, markers: Rows, surprise: Array) -> None:
+        """Put the rest of ``markers`` (n,) never seen before where they are, ``surprise`` (n, 3) m from it."""
+        new = ~self.ever_seen[markers]
+        self.rest[markers[new]] += surprise[new]
 
     def _moves_with_neighbours(self, markers: Rows, surprise: Array, covariances: Array) -> NDArray[np.bool_]:
         """Return which markers are about as far from their prediction, ``surprise`` (n, 3), as their neighbours
@@ -342,11 +362,6 @@ def _assign_apart(cost: Array, pairs: Pairs, limit: float) -> tuple[Rows, Rows]:
 def _total(cost: Array, rows: Rows, cols: Rows, limit: float) -> float:
     """Return cost of an assignment, with ``limit`` for every row that is left alone."""
     return float(cost[rows, cols].sum() + limit * (len(cost) - len(rows)))
-
-
-def _nearest(points: Array, places: Array) -> Array:
-    """Return how far (n,) the ``points`` (n, 3) are from the nearest of the ``places`` (k, 3), inf without any."""
-    return np.asarray(np.linalg.norm(points[:, None] - places[None], axis=2).min(axis=1, initial=np.inf))
 
 
 def _untouched(pairs: Pairs, rows: Rows) -> NDArray[np.bool_]:

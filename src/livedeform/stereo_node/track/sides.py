@@ -33,8 +33,22 @@ def outward_side(body: Surface, points: Array) -> Array | None:
         away = step * body.diagonal * normal
         votes += int(body.contains(asked - away).sum()) - int(body.contains(asked + away).sum())
     if 2 * abs(votes) <= len(asked):
+        votes = _votes_of_those_above(body, asked, normal)
+    if 2 * abs(votes) <= len(asked):
         return None
     return normal if votes > 0 else -normal
+
+
+def _votes_of_those_above(body: Surface, points: Array, normal: Array) -> int:
+    """Count for which side ``normal`` (3,) points (n, 3) m are that stand off the ``body``, as balls and pins do: along
+    it their distance from the surface grows, one to one where it is the nearest place's own normal.
+
+    Those inside have no voice: cameras may look at them through the thicker part as well.
+    """
+    step = STEPS[0] * body.diagonal
+    slope = (body.distance(points + step * normal) - body.distance(points - step * normal)) / (2 * step)
+    clear = (np.abs(slope) > 0.5) & ~body.contains(points)  # those beside the body are nearest to it across the normal
+    return int(np.sign(slope[clear]).sum())
 
 
 def sees_outside(T_phantom_left: Array, points: Array, outward: Array) -> bool:
