@@ -46,10 +46,11 @@ OF_ONE_FUNCTION = {
         "LEAST_MARKERS", "LEAST_MOMENTS",  # one more than place a rigid body; before and in a press
         "MOTION", "PER_UNIT", "TRANSFORMS",  # lengths of vectors, and what a unit stands for
         "RELIABILITY",  # that of a published method, beside which ours is shown
+        "FIELDS", "PIXEL",  # coefficients of a linear field; what a setting is a twentieth of
     },
     "guards against zero and round-off": {
         "FLAT", "LEAST_OF_A_LINE", "LEAST_SIGMA", "NEARLY_NOTHING", "NOTHING", "ON_BOUND", "RANK", "RATES", "SEEN",
-        "SOME_MOTION", "SOONER", "STILL", "TINY", "TINY_VARIANCE",
+        "SINGLE", "SOME_MOTION", "SOONER", "STILL", "TINY", "TINY_VARIANCE",
     },
     "steps of differences": {"AMPLITUDE_STEPS", "CLOCK_STEP", "DIFFERENCE", "SECANT_STEP", "STEP", "TURNS", "WALK"},
     "sharing of work": {

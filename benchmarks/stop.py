@@ -29,6 +29,7 @@ from livedeform.common.checks.recorded import check_recording
 from livedeform.common.experiment.schema import Experiment
 from livedeform.common.experiment.yaml_file import load_experiment
 from livedeform.common.types import MarkerFrame, Pose
+from livedeform.compare_node.interpolation import Interpolated
 from livedeform.run import results
 from livedeform.run.playing import restamped
 from livedeform.shipped import BREAST, shipped
@@ -155,7 +156,9 @@ def computed(out: Path, experiment: Experiment) -> dict[str, float]:
     took["checked"] = time.process_time() - began - sum(took.values())
     head = {"experiment": experiment.name}
     with mock.patch.object(results, "write_markers", lambda *_: took.setdefault("metrics", time.process_time())):
-        metrics = results.write_results(out, experiment, {}, START_NS, 0.0, head, findings, recording)
+        metrics = results.write_results(
+            out, experiment, {}, START_NS, Interpolated(0.0, 0.0), head, findings, recording
+        )
     took["metrics"] -= began + took["read"] + took["checked"]
     print(f"{len(recording.poses)} poses, {metrics.n_frames} frames, {metrics.n} errors")
     return took

@@ -129,13 +129,16 @@ def _date(stamp_ns: int) -> str:
     return datetime.fromtimestamp(stamp_ns // 1_000_000_000, UTC).strftime(" (%Y-%m-%d %H:%M UTC)")
 
 
-def fit_findings(bag: BagReader, experiment: Experiment, recording: Recording) -> list[Finding]:
-    """Check whether a bag serves an experiment, by every check that there is."""
+def fit_findings(
+    bag: BagReader, experiment: Experiment, recording: Recording, *, is_part: bool = False
+) -> list[Finding]:
+    """Check whether a bag serves an experiment, by every check that there is; ``is_part``: as of `check_recording`."""
     wrong = _wrong_types(bag)
     if wrong:  # nothing more can be read
         return wrong
     acting = experiment.of_recording(recording.own_name)
-    return [*_Fit(bag, acting).findings(), *check_named(recording, acting), *check_recording(recording, acting)]
+    checked = check_recording(recording, acting, is_part=is_part)
+    return [*_Fit(bag, acting).findings(), *check_named(recording, acting), *checked]
 
 
 class _Tracks:

@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 
 import livedeform
 from livedeform.common import topics as t
+from livedeform.common.bags import layouts
 from livedeform.common.bags.recording_writer import RecordingWriter
 from livedeform.common.bags.write import BagWriter
 from livedeform.common.errors import InputError
@@ -77,8 +78,9 @@ class Writer:
         """Write the markers that were seen at one moment.
 
         ``ids`` (n,) as in markers.csv; ``points`` (n, 3) m, a row of NaN for a marker that was not seen; ``sigma`` m,
-        one number or (n,), the standard deviation of one coordinate, or ``covariances`` (n, 3, 3) m2. Without either,
-        a diagnosis takes the noise from the recording itself where it can. ``InputError`` for what cannot be meant.
+        one number or (n,), the standard deviation of one coordinate, or ``covariances`` (n, 3, 3) m2, NaN where they
+        are not known. Without either, a diagnosis takes the noise from the recording itself where it can.
+        ``InputError`` for what cannot be meant.
         """
         where = "Writer.points"
         places = _shaped(points, (-1, 3), where)
@@ -87,9 +89,9 @@ class Writer:
             raise InputError(f"{len(places)} points need as many ids, whole numbers >= 0", where=where)
         if len(np.unique(numbers)) < len(numbers):
             raise InputError("an id is there twice", where=where, remedy="give every marker its own id")
-        seen = np.isfinite(places).all(axis=1)
+        seen = np.asarray(np.isfinite(places).all(axis=1))
         _near(places[seen], where)
-        spread = _covariances(len(places), sigma, covariances)
+        spread = _covariances(seen, sigma, covariances)
         R = self._T[:3, :3]
         frame = MarkerFrame(
             self._stamp(seconds, where),
@@ -210,10 +212,17 @@ def _near(points: Array, where: str) -> None:
         raise InputError(f"a coordinate of {far:g} m is not plausible", where=where, remedy="give metres")
 
 
-def _covariances(n: int, sigma: float | ArrayLike | None, covariances: ArrayLike | None) -> Array:
-    where = "Writer.points"
-    if covariances is not None:
-        return _shaped(covariances, (n, 3, 3), where) if n else np.zeros((0, 3, 3))
+def _covariances(seen: NDArray[np.bool_], sigma: float | ArrayLike | None, covariances: ArrayLike | None) -> Array:
+    """Return the covariances (n, 3, 3) m2 of markers, of which some were ``seen`` (n,); NaN where not known."""
+    where, n = "Writer.points", len(seen)
+    if covariances is not None and n:
+        given = _shaped(covariances, (-1, 3, 3), where)
+        if len(given) != n:
+            raise InputError(f"{n} points need as many covariances, not {len(given)}", where=where)
+        if layouts.wrong_covariances(given[seen]).any():
+            what = "a covariance is zero, negative, infinite or incomplete"
+            raise InputError(what, where=where, remedy="give it in m2, or NaN where it is not known")
+        return given
     if sigma is None:
         return np.full((n, 3, 3), np.nan)
     each = np.broadcast_to(np.asarray(sigma, float), (n,))

@@ -26,8 +26,8 @@ def test_twins_share_what_is_solved_and_differ_in_noise_or_elements() -> None:
     assert one.settings.sampling.mesh_vertices != two.settings.sampling.mesh_vertices
 
 
-@pytest.mark.parametrize("name", ["block", "cuboid"])
-@pytest.mark.parametrize("thickness", [0.003, pytest.param(0.005, marks=pytest.mark.slow), 0.007])
+@pytest.mark.parametrize("name", ["block", pytest.param("cuboid", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("thickness", [0.003, *(pytest.param(t, marks=pytest.mark.slow) for t in (0.005, 0.007))])
 def test_the_truth_s_layer_is_as_thick_as_it_says(name: str, thickness: float) -> None:
     case = next(c for c in cases("proof") if c.effect == "skin")
     effect = {"name": "skin", "ratio": 2.0, "thickness": thickness}

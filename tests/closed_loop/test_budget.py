@@ -58,6 +58,7 @@ def test_a_part_of_the_time_may_be_kept_for_what_comes_last():
     assert not budget.allows("the end") and "was used up; not done: one more, the end" in budget.notes[0]
 
 
+@pytest.mark.slow
 def test_a_budget_that_suffices_changes_nothing():
     whole, within = closed(TILT, names=NAMES), closed(TILT, names=NAMES, budget=TimeBudget(1e6))
     assert [effect_json(e) for e in within.effects] == [effect_json(e) for e in whole.effects]

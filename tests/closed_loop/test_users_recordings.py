@@ -68,7 +68,7 @@ def values_of(found: Diagnosis) -> dict[str, float]:
     return {e.name: float(value) for e in found.effects for value in e.values.values()}
 
 
-@pytest.mark.parametrize("seed", [0, 1, 10])
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 10))])
 def test_what_is_added_was_fitted_to_its_end(seed: int) -> None:
     """A fit that was left behind after two runs of the model was scored as if it had made its next step, and added
     where it was: of a body of 0.3 times the stiffness a third was explained, and the rest by no known effect."""
@@ -121,7 +121,9 @@ def test_points_that_the_tracker_states_to_be_poor_make_nothing_up(seed: int, ra
         assert value == pytest.approx(true, rel=0.03)  # measured 0.015
 
 
-@pytest.mark.parametrize(("seed", "seconds"), [(0, 2.0), pytest.param(1, 4.0, marks=pytest.mark.slow), (0, 10.0)])
+@pytest.mark.parametrize(
+    ("seed", "seconds"), [(0, 2.0), *(pytest.param(*c, marks=pytest.mark.slow) for c in ((1, 4.0), (0, 10.0)))]
+)
 def test_an_error_that_changes_slowly_is_not_said_to_be_physics(seed: int, seconds: float) -> None:
     """It was `unexplained`, with p = 0: within the presses it lasts for, no recording tells it from motion."""
     fit, test = (
@@ -157,7 +159,9 @@ def test_a_recording_without_a_press_confirms_nothing_that_a_press_shows(effect:
     assert [a.candidate.name for a in found.selection.added] == [effect.name]  # what was fitted is on record
 
 
-@pytest.mark.parametrize(("marker", "off"), [(25, 0.6e-3), (3, 1.0e-3), (None, 0.0)])
+@pytest.mark.parametrize(
+    ("marker", "off"), [(25, 0.6e-3), pytest.param(3, 1.0e-3, marks=pytest.mark.slow), (None, 0.0)]
+)
 def test_a_marker_whose_place_is_wrong_is_named(marker: int | None, off: float) -> None:
     """Trusted less at every moment, it vanished: "explains the recordings within their noise", and not a word."""
 

@@ -206,6 +206,70 @@ def test_what_is_usual_is_not_doubted(change, key, value):
     assert all(f.level == "NOTE" for f in check_declared(experiment, read_body(experiment)))
 
 
+def material(model, **constants):
+    return {"model": model, "youngs_modulus": 4000.0, "poisson_ratio": 0.49, **constants}
+
+
+@pytest.mark.parametrize(
+    ("mu", "alpha", "says"),
+    [
+        ([1000.0, -300.0], [2.0, -2.0], "give mu alpha / 2: [1000, 300]"),
+        ([500.0, -500.0], [2.0, -2.0], "give mu alpha / 2: [500, 500]"),
+        ([1000.0, -300.0], [2.0, 4.0], "leave the term out"),
+        ([0.0, 0.0], [2.0, -2.0], "the sum of mu of the model ogden is not positive"),
+        ([1.0, 1.0], [2.0, 0.0], "an alpha of the model ogden is 0"),
+    ],
+)
+def test_ogden_s_constants_are_judged_by_the_formula_that_they_are_used_in(change, mu, alpha, says):
+    assert says in complaint(change("phantom.material", material("ogden", mu=mu, alpha=alpha)))
+
+
+@pytest.mark.parametrize(
+    ("given", "says"),
+    [
+        (material("yeoh", c1=2000.0, c2=500.0), r"4000 Pa.*1342 Pa.*times 0\.336.*youngs_modulus as 1\.192e\+04"),
+        (material("mooney_rivlin", c10=1000.0, c01=500.0), r"\(c10, c01\).*3000 Pa.*1342 Pa"),
+        (material("ogden", mu=[3000.0, 500.0], alpha=[2.0, -2.0]), "3500 Pa.*1342 Pa"),
+        (material("ogden", mu=[400.0, 471.1], alpha=[2.0, 4.0]), r"Ogden's own formula.*\[400, 942\.2\]"),
+        (material("yeoh", c1=671.0, c2=100.0), None),
+        (material("yeoh", c1=1.0, c2=0.2), None),
+        (material("yeoh", c2_ratio=0.2), None),
+        (material("mooney_rivlin", c10=0.8, c01=0.2), None),
+        (material("ogden", mu=[1.0, 1.0], alpha=[2.0, -2.0]), None),
+        (material("ogden", mu=[1000.0, 340.0], alpha=[2.0, -2.0]), None),
+        (material("neo_hookean"), None),
+    ],
+)
+def test_constants_in_pascals_that_contradict_the_modulus_are_doubted(change, given, says):
+    """They are scaled to it, which is right for ratios; of constants in Pa one of the two numbers is wrong."""
+    experiment = load_experiment(change("phantom.material", given))
+    found = [f for f in check_declared(experiment, read_body(experiment)) if "phantom.material" in f.text]
+    assert len(found) == (says is not None)
+    assert all(f.level == "WARN" and re.search(says, f"{f.text}; {f.remedy}") for f in found)
+
+
+@pytest.mark.parametrize(("end", "doubted"), [(0.0, False), (0.03, True), (-0.03, True), (0.00005, False)])
+def test_a_probe_s_mesh_in_another_frame_than_the_probe_s_is_doubted(folder, change, end, doubted):
+    """The contact face lies at z = 0 of the frame 'probe', and the probe behind it at z <= 0."""
+    box = trimesh.creation.box((0.03, 0.014, 0.03)).apply_translation((0.0, 0.0, end - 0.015))
+    box.export(folder / "probe.stl")
+    experiment = load_experiment(change("probe", {"shape": {"mesh": "probe.stl"}}))
+    found = [f for f in check_declared(experiment, read_body(experiment)) if "probe.shape.mesh" in f.text]
+    assert bool(found) == doubted
+    assert all(f.level == "WARN" and f"ends at z = {1e3 * end:+.3g} mm" in f.text for f in found)
+
+
+@pytest.mark.parametrize(("factor", "says"), [(1000.0, "but the body is"), (None, "not closed")])
+def test_a_probe_s_mesh_that_cannot_be_is_refused(folder, change, factor, says):
+    box = trimesh.creation.box((0.03, 0.014, 0.03)).apply_translation((0.0, 0.0, -0.015))
+    if factor is None:
+        box = trimesh.Trimesh(box.vertices, box.faces[2:], process=False)
+    else:
+        box.apply_scale(factor)
+    box.export(folder / "probe.stl")
+    assert says in complaint(change("probe", {"shape": {"mesh": "probe.stl"}}))
+
+
 def test_places_of_markers_in_millimetres_are_refused(folder):
     """Of a body of 98 mm; up to the body's own size they were taken as they are, and any error was allowed for."""
     (folder / "markers.csv").write_text("id,x,y,z,sigma\n1,0,0,0.05,0.05\n")
@@ -437,6 +501,15 @@ def test_whether_kinds_are_stated_is_told_by_the_columns(folder, header):
         ("sgima", "sigma"),
         ("sigma_mm", "sigma"),
         ("sigma (mm)", "sigma"),
+        ("sigma/mm", "sigma"),
+        ("sigma in mm", "sigma"),
+        ("Sigmamm", "sigma"),
+        ("sigma [\u03bcm]", "sigma"),  # Greek mu, and the sign of micro
+        ("sigma [\u00b5m]", "sigma"),
+        ("sigma_position", "sigma"),
+        ("\u03c3 / mm", "sigma"),
+        ("\uff53\uff49\uff47\uff4d\uff41", "sigma"),  # the same letters in full width
+        ("\uff4bind", "kind"),
     ],
 )
 def test_a_mistyped_column_is_not_left_out_in_silence(folder, name, wanted):

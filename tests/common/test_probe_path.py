@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+from unittest import mock
+
 import numpy as np
 import pytest
 import trimesh
 
+from livedeform.common.bags.recording import Recording
+from livedeform.common.checks import probe_path as module
 from livedeform.common.checks.probe_path import probe_path
+from livedeform.common.checks.recorded import check_recording
 from livedeform.common.experiment.schema import ProbeShape
 from livedeform.common.experiment.surface import Surface
-from livedeform.common.types import Pose
+from livedeform.common.experiment.yaml_file import load_experiment
+from livedeform.common.types import Pose, Wrench
 
 BLOCK = trimesh.creation.box((0.08, 0.06, 0.045))
 BLOCK.apply_translation((0.0, 0.0, 0.0225))
@@ -33,3 +40,15 @@ def test_a_short_press_is_seen_in_a_long_recording(minutes: int, seed: int) -> N
     assert path.seconds[np.argmax(path.depths > 0.0)] == pytest.approx(t[np.argmax(depth > 0.0)], abs=0.05)
     assert (path.seconds[0], path.seconds[-1]) == (0.0, pytest.approx(t[-1]))
     assert len(path.seconds) < 1300 and (np.diff(path.seconds) > 0.0).all()
+
+
+def test_a_recordings_path_is_worked_out_once_for_all_checks(folder: Path) -> None:
+    """Of half an hour it takes a second, and three checks did it each."""
+    stamps = [round(2e7 * k) for k in range(400)]
+    poses = [Pose(s, np.array([0.0, 0.0, 0.06 - 1e-4 * min(k, 150)]), DOWN) for k, s in enumerate(stamps)]
+    wrenches = [Wrench(s, np.zeros(3), np.zeros(3)) for s in stamps]
+    recording = Recording(Path(), stamps[0], stamps[-1], [], poses, wrenches, {}, {})
+    experiment = load_experiment(folder, geometry=False)
+    with mock.patch.object(module, "probe_path", side_effect=probe_path) as asked:
+        found = check_recording(recording, experiment)
+    assert any("below the surface" in f.text for f in found) and asked.call_count == 1

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 
 from livedeform.common.types import MarkerFrame, PredictedMarkers
 from livedeform.compare_node.associate import Associator, interpolate, remainder
+from livedeform.compare_node.interpolation import InterpolationBound
 
 MS = 1_000_000
 
@@ -107,6 +110,69 @@ def test_no_frame_is_further_off_than_interpolation_is_said_to_be(press: str, ra
         largest.append((wrong, bound))
     wrong, bound = np.max(largest, axis=0)
     assert bound < 5.0 * wrong  # measured 1.0 to 3.9 times: what is much too large would doubt everything
+
+
+def played(at: Callable[[float], float], stamps: np.ndarray, frames: np.ndarray, noise: np.ndarray | None = None):
+    """Return the residuals and the associator of one marker that moves as ``at`` (m) says, predicted at ``stamps`` s
+    with ``noise`` (n, 3) m and measured at ``frames`` s, in the order of both."""
+    off = np.zeros((len(stamps), 3)) if noise is None else noise
+    point = np.array([0.0, 0.0, -1.0])
+    messages = [predicted(1e3 * s, [0], (at(s) * point + e)[None]) for s, e in zip(stamps, off, strict=True)]
+    messages += [frame(1e3 * s, [0], (at(s) * point)[None]) for s in frames]
+    associator, out = Associator(), []
+    for m in sorted(messages, key=stamp_of):
+        out += associator.add_measured(m) if isinstance(m, MarkerFrame) else associator.add_predicted(m)
+    return [*out, *associator.flush()], associator
+
+
+@pytest.mark.parametrize("rate", [2.1, 5.0])
+@pytest.mark.parametrize("seconds", [0.1, 0.4])
+def test_a_marker_that_moves_in_steps_is_no_further_off_than_is_said(seconds: float, rate: float):
+    """It stands still, moves for so long and stands still again, within a bracket or two."""
+    for phase in np.linspace(0.0, 1.0 / rate, 5, endpoint=False):
+        residuals, associator = played(
+            lambda t: 0.002 * (np.floor(t) + np.clip((t % 1.0) / seconds, 0.0, 1.0)),
+            np.arange(phase, 5.0, 1.0 / rate),
+            np.arange(0.0, 5.0, 1.0 / 30.0),
+        )
+        wrong = max(r.distances.max() for r in residuals)
+        assert wrong < 1.1 * associator.interpolation_bound.value  # measured up to 1.00; it was up to 6.3
+
+
+def in_pairs(every: float, apart: float) -> np.ndarray:
+    """Stamps (s) of which two come ``apart`` s from each other, ``every`` so many."""
+    return np.sort(np.concatenate([np.arange(0.0, 10.0, every), np.arange(0.0, 10.0, every) + apart]))
+
+
+STAMPS = {
+    "even": np.arange(0.0, 10.0, 0.05),
+    "with a pause": np.concatenate([np.arange(0.0, 4.0, 0.02), np.arange(4.45, 10.0, 0.02)]),
+    "in pairs 2 ms apart": in_pairs(0.1, 0.002),
+    "in pairs 0.1 ms apart": in_pairs(0.05, 1e-4),
+}
+
+
+@pytest.mark.parametrize("stamps", STAMPS)
+def test_noise_between_predictions_close_together_is_no_bend(stamps: str):
+    """At constant speed interpolation is wrong by the noise alone: 0.02 mm of each coordinate."""
+    noise = 2e-5 * np.random.default_rng(0).standard_normal((len(STAMPS[stamps]), 3))
+    _, associator = played(lambda t: 0.005 * t, STAMPS[stamps], np.arange(0.2, 9.8, 1.0 / 30.0), noise)
+    found = associator.interpolation_bound.found
+    assert found.judged < 1.2e-4  # measured 0.076 to 0.085 mm
+    assert found.largest < 2.0e-4  # measured 0.11 to 0.15 mm; it was 0.70 with a pause, 1.3 and 12 in pairs
+
+
+def test_what_is_judged_is_of_all_frames():
+    """Of 100 frames that have predictions of their own and two between others, the two are not what is judged."""
+    found = InterpolationBound()
+    for _ in range(98):
+        found.add_exact()
+    assert np.isnan(found.found.largest) and np.isnan(found.found.judged)  # none was interpolated
+    x = [predicted(100.0 * k, [0], np.array([[0.0, 0.0, 0.001 * k**2]])) for k in range(4)]
+    for stamp in (140, 150):
+        found.add((x[0], x[1], x[2]), x[3:], stamp * MS)
+    assert found.found.largest == found.value == pytest.approx(0.001)  # on the lines of both neighbours
+    assert found.found.judged == pytest.approx(np.sqrt((0.001**2 + 0.0008**2) / 100))
 
 
 def test_the_bound_does_not_depend_on_what_arrives_first():

@@ -84,6 +84,23 @@ def test_a_verdict_that_interpolation_may_have_made_is_doubted(bound: float, lev
     assert ("interpolation between predictions may be wrong by up to 3.00 mm" in judged.sentence) == (level == "WARN")
 
 
+@pytest.mark.parametrize(("judged", "level"), [(0.002, "OK"), (0.003, "WARN")])
+def test_a_few_frames_between_predictions_far_apart_doubt_no_run(judged: float, level: str):
+    """One frame may be 9 mm off: what is judged is the rmse and the 95th percentile of all."""
+    judgement = judge(replace(metrics(EVERY), interpolation_bound=0.009, interpolation_judged=judged))
+    assert judgement.level == level
+    assert ("may be wrong by up to 9.00 mm" in judgement.sentence) == (level == "WARN")
+
+
+@pytest.mark.parametrize("skipped", [0, 250])
+def test_poses_that_the_model_was_too_slow_for_are_not_to_be_recorded_more_often(skipped: int):
+    m = metrics(EVERY)
+    assert m.coverage is not None
+    sentence = judge(replace(m, interpolation_bound=0.003, coverage=replace(m.coverage, skipped=skipped))).sentence
+    assert ("250 poses were overtaken" in sentence and "`--rate max`" in sentence) == bool(skipped)
+    assert (" mm: record the poses more often" in sentence) != bool(skipped)
+
+
 def test_both_presses_are_counted():
     coverage = metrics([k for k in EVERY if k < 50]).coverage
     assert coverage is not None

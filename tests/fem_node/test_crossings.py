@@ -132,6 +132,7 @@ def test_memory_is_a_buffer_and_some_numbers_for_each_triangle() -> None:
     assert one < 60e6 and two < 1.1 * one  # measured 48.1 and 48.9 MB
 
 
+@pytest.mark.slow
 def test_a_surface_of_more_than_sixty_thousand_triangles_is_checked_too() -> None:
     """Four balls of 20 480 triangles, two of them one another's; too coarse for its elements to be thinned out."""
     places = ((0.0, 0.0, 0.0), (0.0, 0.03, 0.0), (0.05, 0.0, 0.0), (0.1, 0.0, 0.0))

@@ -11,10 +11,12 @@ from bodies import EXACT, block_space, moment, plane, soft, symmetry
 from livedeform.common.types import EffectValues
 from livedeform.fem_node.effects import apply_effects
 from livedeform.fem_node.items.loads import hung_masses
+from livedeform.fem_node.model import PhantomModel
+from livedeform.fem_node.path.direction import Direction
 from livedeform.fem_node.path.mechanics import Mechanics
 from livedeform.fem_node.path.timeline import Instant, Timeline
 from livedeform.fem_node.physics.memory import memory_of
-from livedeform.fem_node.physics.record import DeadLoad, Inertia, MaterialSpec
+from livedeform.fem_node.physics.record import DeadLoad, Inertia, MaterialSpec, Prony
 
 L, SIDE, STEP, GRAVITY = 0.1, 0.02, 0.002, np.array([0.0, 0.0, -9.81])
 SPACE = block_space((SIDE, SIDE, L), (1, 1, 4))
@@ -100,3 +102,34 @@ def test_the_timeline_counts_from_the_release():
     for stamp, active, acting in ((100_000_000, False, -0.1), (250_000_000, True, 0.05)):
         assert line.moment(BAR, Instant(stamp, STEP, active), None).acting == pytest.approx(acting)
     assert Timeline(0, 0, release=0.0).moment(BAR, Instant(0, np.inf, active=True), None).acting == np.inf
+
+
+RELEASE = 0.2  # s
+CREEPING = replace(BAR, inertia=None, gravity=np.zeros(3), prony=Prony((0.4,), (0.5,)), release=RELEASE)
+TOP = np.array([[0.0, 0.0, L]])
+
+
+@pytest.mark.parametrize("delay", [0.1, 0.0123456789, 0.3])
+@pytest.mark.parametrize("seconds", [(0.5, 1.5), (0.0, 0.5)])
+def test_a_body_that_creeps_does_so_from_where_its_load_begins(delay, seconds):
+    """Without inertia, too, there is a moment where the load begins, between two stamps or at one."""
+    at_once, later = (
+        [model.predict(None, stamp).markers[0, 2] for stamp in (0, *(round(1e9 * (RELEASE + d + s)) for s in seconds))]
+        for d, model in ((d, PhantomModel(SPACE, late(d, CREEPING), markers=TOP)) for d in (0.0, delay))
+    )
+    assert at_once[-1] < L - 0.004
+    np.testing.assert_allclose(later[-1], at_once[-1], atol=1e-9)  # it was up to 0.12 mm where the load came by a ramp
+
+
+def test_the_creep_s_derivative_by_the_delay_is_that_of_whole_runs():
+    delay, h, stamps = 0.1, 1e-3, [0, 150_000_000, *range(350_000_000, 1_500_000_000, 100_000_000)]
+
+    def model(d):
+        return PhantomModel(SPACE, late(d, CREEPING), markers=TOP)
+
+    direction = Direction("delay", late(delay + 1e-5, CREEPING), 1e-5)
+    found = model(delay).simulate(None, stamps, [direction], start_ns=0).d_markers[:, 0, 2, 0]
+    runs = [model(delay + d).simulate(None, stamps, start_ns=0).predictions for d in (h, -h)]
+    whole = np.array([(a.markers - b.markers)[0, 2] / (2.0 * h) for a, b in zip(*runs, strict=True)])
+    assert np.abs(whole).max() > 1e-4  # m/s
+    np.testing.assert_allclose(found, whole, atol=0.01 * np.abs(whole).max())

@@ -126,7 +126,7 @@ def test_a_library_is_found_again_for_the_same_probe_only(tmp_path):
     }  # fmt: skip
 
 
-@pytest.mark.parametrize("offset", [[0.0, 0.0, 5e-4], [2e-3, 0.0, 1e-3]])
+@pytest.mark.parametrize("offset", [[0.0, 0.0, 5e-4], pytest.param([2e-3, 0.0, 1e-3], marks=pytest.mark.slow)])
 def test_a_probe_that_is_displaced_is_learnt_where_it_is(offset):
     """Where the tool offset puts the probe where it was without, everything is as it was, to the contact's tolerance;
     with entries at the recorded poses c was 2097 and 11 704 1/m, and the full model answered every pose."""

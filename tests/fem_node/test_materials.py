@@ -8,6 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from livedeform.common.errors import InputError
+from livedeform.common.experiment.constants import shear_modulus_of
 from livedeform.fem_node.element.simd import one_by_one, side_by_side
 from livedeform.fem_node.materials import MATERIALS, make_material
 from livedeform.fem_node.materials.volume import add_pressure
@@ -111,6 +112,52 @@ def test_a_flattened_element_has_no_finite_energy_and_stops_nobody(name):
     with np.errstate(all="ignore"):
         _material(name).response(F, np.ones(1), psi, P, A)
     assert not np.isfinite(psi[0])
+
+
+L = np.array([0.7, 1.25, 1.0 / (0.7 * 1.25)])  # principal stretches without a change of volume
+I1, I2 = (L**2).sum(), (L**-2).sum()
+
+
+def _ogden(mu, alpha):
+    """Return the energy (Pa) of Ogden's formula of 1972 at the stretches L."""
+    return sum(m / a * ((L**a).sum() - 3.0) for m, a in zip(mu, alpha, strict=True))
+
+
+@pytest.mark.parametrize(
+    ("model", "constants", "energy"),
+    [
+        ("yeoh", {"c1": 800.0, "c2": 300.0, "c3": 50.0}, 800 * (I1 - 3) + 300 * (I1 - 3) ** 2 + 50 * (I1 - 3) ** 3),
+        ("mooney_rivlin", {"c10": 900.0, "c01": 250.0}, 900 * (I1 - 3) + 250 * (I2 - 3)),
+        ("ogden", {"mu": [1000.0, 300.0], "alpha": [2.0, -2.0]}, _ogden([1000.0, -300.0], [2.0, -2.0])),
+        ("ogden", {"mu": [300.0, 1400.0], "alpha": [2.0, -4.0]}, _ogden([300.0, -700.0], [2.0, -4.0])),
+        ("ogden", {"mu": [1.0, 1.0], "alpha": [2.0, -2.0]}, _ogden([1.0, -1.0], [2.0, -2.0])),
+        ("ogden", {"mu": [500.0, 700.0], "alpha": [1.3, 5.0]}, _ogden([1000.0 / 1.3, 280.0], [1.3, 5.0])),
+    ],
+)
+def test_constants_in_pascals_are_those_of_the_formula(model, constants, energy):
+    """With the modulus that they have at small strain, which is the one that everybody asks `shear_modulus_of`."""
+    modulus = 2.0 * (1.0 + NU) * shear_modulus_of(model, constants)
+    psi, _, _ = _evaluate(make_material(MaterialSpec(model, modulus, NU, constants)), np.diag(L)[None])
+    np.testing.assert_allclose(psi[0] / 1.3, energy, rtol=1e-12)  # of a modulus that is 1.3 times as large
+
+
+@pytest.mark.parametrize(
+    ("model", "constants"),
+    [
+        ("ogden", {"mu": [500.0, -500.0], "alpha": [2.0, -2.0]}),
+        ("ogden", {"mu": [1000.0, -300.0], "alpha": [2.0, -2.0]}),
+        ("ogden", {"mu": [1000.0, -300.0], "alpha": [2.0, 4.0]}),
+        ("ogden", {"mu": [1000.0, 300.0], "alpha": [2.0, 0.0]}),
+        ("ogden", {"mu": [0.0, 0.0], "alpha": [2.0, -2.0]}),
+        ("ogden", {"mu": [1.0, 2.0], "alpha": [2.0]}),
+        ("yeoh", {"c1": 0.0, "c2": 100.0}),
+        ("mooney_rivlin", {"c10": 500.0, "c01": -500.0}),
+    ],
+)
+def test_constants_without_stiffness_are_refused_by_the_solver_as_well(model, constants):
+    with pytest.raises(InputError) as caught:
+        make_material(MaterialSpec(model, E, NU, constants))
+    assert caught.value.remedy
 
 
 def test_an_unknown_model_names_the_known_ones():

@@ -20,7 +20,7 @@ from livedeform.fem_node.mesh.structured import block_mesh, hemi_ellipsoid_mesh
 from livedeform.fem_node.model import PhantomModel
 from livedeform.fem_node.output import write_series, write_step
 from livedeform.fem_node.path.walk import WALK
-from livedeform.fem_node.physics.record import DeadLoad, Inertia, Probe, Prony, Support
+from livedeform.fem_node.physics.record import DeadLoad, Inertia, PlasticSet, Probe, Prony, Support
 from livedeform.fem_node.simulator import Recorded, Simulator
 from livedeform.fem_node.solve import solver as solver_module
 
@@ -206,6 +206,30 @@ def test_a_released_body_with_inertia_overshoots(space):
     lowest = min(dropped.predict(None, int(k * 1e7)).markers[0, 2] for k in range(12))
     rest = model.rest().markers[0, 2]
     assert MARKERS[0, 2] - lowest > 1.5 * (MARKERS[0, 2] - rest)
+
+
+@pytest.mark.parametrize(
+    "memory",
+    [
+        {},
+        {"prony": Prony((0.4,), (2.0,))},
+        {"plastic_set": PlasticSet(0.2, 0.0)},
+        {"inertia": Inertia(0.01)},
+        {"loads": (DeadLoad("w", plane(2, HEIGHT), np.array([0.0, 0.0, -0.05])),), "prony": Prony((0.4,), (2.0,))},
+    ],
+    ids=["none", "relaxes", "sets", "rings", "loaded"],
+)
+def test_a_late_probe_stamp_takes_no_weight_off_a_body_that_always_bore_it(space, memory):
+    """A pose that is stamped where the recording starts is of a moment before: weight and loads act there, too."""
+    start, poses = 10**9, [replace(_pose(k, HEIGHT + 0.05), stamp_ns=10**9 + k * 50_000_000) for k in range(4)]
+    model = _model(space, probe=Probe(Box(0.02, 0.012, 0.02, 0.002), time_offset=0.1), **memory)
+    model.reset(start_ns=start)
+    live = [model.predict(pose) for pose in poses]
+    stamps = [pose.stamp_ns - 100_000_000 for pose in poses]
+    rest = model.rest().markers
+    assert live[0].stamp_ns < start and np.abs(rest - MARKERS).max() > 1e-4
+    for prediction in [*live, *model.simulate(poses, stamps, start_ns=start).predictions]:
+        np.testing.assert_allclose(prediction.markers, rest, atol=1e-7)
 
 
 def test_simulate_repeats_predict(space):

@@ -56,8 +56,7 @@ def theory(name: str, strength: float) -> float:
         ("ball", 500.0),
         pytest.param("ball", 1500.0, marks=pytest.mark.slow),
         pytest.param("ball", 4000.0, marks=pytest.mark.slow),
-        ("cylinder", 500.0),
-        pytest.param("cylinder", 4000.0, marks=pytest.mark.slow),
+        *(pytest.param("cylinder", strength, marks=pytest.mark.slow) for strength in (500.0, 4000.0)),
     ],
 )
 def test_a_probe_pulls_by_what_its_work_of_separation_asks_for(name, strength):

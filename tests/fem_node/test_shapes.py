@@ -7,6 +7,7 @@ import pytest
 import trimesh
 
 from livedeform.common.errors import InputError, MeshError
+from livedeform.common.experiment.surface import Surface
 from livedeform.fem_node.contact.probe_shapes import Box, Cylinder, Sphere, TriangleSolid, make_shape
 
 ICOSPHERE = trimesh.creation.icosphere(subdivisions=2, radius=0.01)
@@ -116,3 +117,54 @@ def test_wrong_shapes_are_refused():
     open_box = TriangleSolid(np.asarray(CUBE.vertices), np.asarray(CUBE.faces)[1:])
     with pytest.raises(MeshError, match="edges"):
         open_box.distance(np.zeros((1, 3)))
+
+
+BALL = ICOSPHERE.copy().apply_translation([0.0, 0.0, -0.011])
+BLOCK = trimesh.creation.box(extents=[0.03, 0.014, 0.04]).apply_translation([0.0, 0.0, -0.02])
+WITHIN = trimesh.creation.icosphere(subdivisions=1, radius=0.005).apply_translation([0.0, 0.0, -0.02])
+BESIDE = trimesh.creation.box(extents=[0.01, 0.01, 0.01]).apply_translation([0.03, 0.0, -0.005])
+
+
+def _looking(meshes, turned):
+    """Return vertices (n, 3) m and triangles (k, 3) of meshes, of which some triangles are turned around: by share."""
+    mesh = trimesh.util.concatenate([m.copy() for m in meshes])
+    ends = np.cumsum([len(m.faces) for m in meshes])
+    triangles = np.array(mesh.faces)
+    for end, m, share in zip(ends, meshes, turned, strict=True):
+        some = slice(end - len(m.faces), end - len(m.faces) + round(share * len(m.faces)))
+        triangles[some] = triangles[some, ::-1]
+    return np.asarray(mesh.vertices), triangles
+
+
+@pytest.mark.parametrize("from_file", [False, True])
+@pytest.mark.parametrize(
+    ("meshes", "turned"),
+    [([BALL], [1]), ([BALL], [0.5]), ([BLOCK], [1]), ([BLOCK], [0.3]), ([BLOCK, BESIDE], [0, 1]),
+     ([BLOCK, BESIDE], [1, 0]), ([BLOCK, BESIDE], [0.5, 0.5])],
+)  # fmt: skip
+def test_whichever_way_the_triangles_look_outside_is_outside(tmp_path, meshes, turned, from_file):
+    """Inside out all distances had the other sign, and every pose near the body was one of a probe inside it."""
+    size = _looking(meshes, turned)
+    if from_file:
+        trimesh.Trimesh(*size, process=False).export(tmp_path / "probe.stl")
+        size = tmp_path / "probe.stl"
+    shape, sound = make_shape("mesh", size), make_shape("mesh", _looking(meshes, [0] * len(meshes)))
+    points = random_points(sound)
+    np.testing.assert_allclose(shape.distance(points).d, sound.distance(points).d, atol=1e-9)
+    within = np.any([Surface(m.vertices, m.faces).contains(points) for m in meshes], axis=0)
+    np.testing.assert_array_equal(sound.distance(points).d < 0.0, within)
+
+
+@pytest.mark.parametrize("turned", [0, 1, 0.5])
+def test_what_lies_within_a_probe_is_of_no_account(turned):
+    hollow = make_shape("mesh", _looking([BLOCK, WITHIN], [0, turned]))
+    points = random_points(hollow)
+    full = make_shape("mesh", _looking([BLOCK], [0]))
+    np.testing.assert_array_equal(hollow.distance(points).d, full.distance(points).d)
+
+
+def test_an_open_probe_and_one_in_millimetres_are_refused():
+    with pytest.raises(MeshError, match="not closed"):
+        make_shape("mesh", (BLOCK.vertices, BLOCK.faces[2:]))
+    with pytest.raises(MeshError, match=r"51.92 m across.*metres"):
+        make_shape("mesh", (1000.0 * BLOCK.vertices, BLOCK.faces))

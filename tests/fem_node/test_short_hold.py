@@ -85,7 +85,7 @@ def test_a_body_that_does_not_relax_has_nothing_to_remember():
     np.testing.assert_array_equal(top(held_for(0.5, elastic)), top(elastic))
 
 
-@pytest.mark.parametrize("inertia", [None, Inertia(0.002)])
+@pytest.mark.parametrize("inertia", [None, pytest.param(Inertia(0.002), marks=pytest.mark.slow)])
 def test_sensitivities_know_how_it_was_held(inertia):
     """Of the time, the modulus and the relaxation, against differences of two runs."""
     physics = held_for(2.0, replace(BAR, inertia=inertia))

@@ -63,6 +63,25 @@ def test_a_bond_that_comes_free_does_so_smoothly():
     )  # measured 2.45; nodes that come free one row at a time leave steps of nothing
 
 
+@pytest.mark.parametrize("angle", [0.0, 0.7])
+@pytest.mark.parametrize("stiffness", [None, 3e5])
+def test_a_bond_that_only_just_comes_free_is_the_bond(angle, stiffness):
+    """Nodes at the rim went onto springs as soon as anything was free: with 1e-6 of the base free, a marker at the rim
+    of a block of 60 mm in cells of 20, 10 and 5 mm sank by 0.53, 0.27 and 0.18 mm; now by less than 0.001."""
+    whole = Support(plane(2, 0.0), *(("fixed",) if stiffness is None else ("spring", stiffness)))
+
+    def hung(fraction):
+        support = replace(whole, region=base_debonding.StillBonded(whole.region, angle, fraction))
+        return solve(block_space(), replace(soft(0.45, 2e3), supports=(support,)), [9.81 * 0.3, 0.0, -2.0]).u
+
+    bonded = hung(0.0)
+    moved = [np.abs(hung(fraction) - bonded).max() for fraction in (1e-9, 1e-6, 1e-4, 1e-3, 1e-2, 0.1)]
+    assert moved[0] < 1e-4 * moved[-1]  # measured 0
+    assert moved[1] < 2e-3 * moved[-1]  # 0; towards a corner 5.2e-4, since it comes free sooner
+    assert moved[2] < 2e-2 * moved[-1]  # 3.8e-4, 5.1e-3
+    assert min(np.diff(moved[1:])) > 0.0
+
+
 @pytest.mark.parametrize(("mu", "sticks"), [(0.5, True), (0.05, False)])
 def test_friction_holds_up_to_mu_times_the_pressure(mu, sticks):
     """A sideways pull of 0.2 weights: it sticks at mu = 0.5, at mu = 0.05 the spring takes the rest."""

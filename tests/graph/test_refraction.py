@@ -5,12 +5,14 @@ from __future__ import annotations
 
 import itertools
 import json
+import shutil
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import small
+import yaml
 from rclpy.serialization import deserialize_message
 from scene import looking_down, make_test_rig
 from visualization_msgs.msg import Marker
@@ -84,9 +86,10 @@ def seen(dome: Dome, moments: list[Prediction]) -> list[MarkerFrame]:
     return frames
 
 
-def off(dome: Dome, frames: list[MarkerFrame], out: Path) -> np.ndarray:
+def off(dome: Dome, frames: list[MarkerFrame], out: Path, *, at_frames: bool = False) -> np.ndarray:
     """How far (m) the run's internal markers are from the model's, which made what it was given."""
-    run(RunOptions(dome.folder, small.write_bag(out.parent / "seen.mcap", dome.poses, frames), out), lambda *_: None)
+    bag = small.write_bag(out.parent / "seen.mcap", dome.poses, frames)
+    run(RunOptions(dome.folder, bag, out, at_frames=at_frames), lambda *_: None)
     assert json.loads((out / "metrics.json").read_text())["verdict"] == "OK"
     errors = load_recording(out / "run.mcap").errors
     assert len(errors) == len(frames)
@@ -107,6 +110,26 @@ def test_a_frame_is_seen_through_the_surface_of_its_own_moment(share: float, dom
     """Frames between poses: that of the pose before was taken, and put markers off."""
     moments = [between(a, b, share) for a, b in itertools.pairwise(dome.direct)]
     assert off(dome, seen(dome, moments), tmp_path / "out").max() < 1e-7  # measured 2e-9
+
+
+def test_predictions_at_frames_give_each_frame_the_surface_of_its_own_moment(dome: Dome, tmp_path: Path):
+    """They followed the corrected frames, which were seen through the surface of the frame before."""
+    assert off(dome, seen(dome, dome.direct), tmp_path / "out", at_frames=True).max() < 1e-7
+
+
+def test_of_a_body_without_a_probe_too(dome: Dome, tmp_path: Path):
+    """It swells by 2 % of its volume from one frame to the next."""
+    folder = tmp_path / "swells"
+    shutil.copytree(dome.folder, folder)
+    document = yaml.safe_load((folder / "experiment.yaml").read_text())
+    document["effects"].append({"name": "swelling", "rate": 0.2, "offset": 0.0})
+    del document["probe"]
+    (folder / "experiment.yaml").write_text(yaml.safe_dump(document))
+    model = PhantomModel.from_experiment(load_experiment(folder))
+    model.reset(small.START_NS)
+    direct = [model.predict(None, pose.stamp_ns) for pose in dome.poses[:4]]
+    swells = Dome(folder, [], direct)
+    assert off(swells, seen(swells, direct), tmp_path / "out").max() < 1e-7
 
 
 def test_a_mesh_that_is_heard_is_as_smooth_as_the_one_that_is_published(dome: Dome):

@@ -46,5 +46,19 @@ def test_two_things_are_two(tmp_path: Path):
     assert len(said_of(tmp_path / "run.mcap", statuses)) == 2
 
 
+@pytest.mark.parametrize(("n", "doubted"), [((3, 2), True), ((2, 2), False), ((2, 2, 2), True), ((4,), False)])
+def test_errors_of_several_kinds_count_together(n: tuple[int, ...], doubted: bool, tmp_path: Path):
+    """A frame is wrong whatever is wrong with it: several kinds of less than a tenth each may be a third together."""
+    texts = ("the left picture is black", "no marker was identified", EPIPOLAR)
+    statuses = [("ERROR", text) for times, text in zip(n, texts, strict=False) for _ in range(times)]
+    hidden = [("WARN", FEW)] * 10  # which does not count with them
+    found = said_of(tmp_path / "run.mcap", [*statuses, *hidden, *[("OK", FEW)] * (40 - len(statuses) - len(hidden))])
+    assert found == (
+        [f"stereo_node says of {sum(n)} of 40 frames: {len(n)} kinds of faults, most often ({n[0]}): {texts[0]}"]
+        if doubted
+        else []
+    )
+
+
 def test_without_pictures_nothing_is_said(tmp_path: Path):
     assert said_of(tmp_path / "run.mcap", []) == []

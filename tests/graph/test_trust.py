@@ -70,8 +70,15 @@ def test_the_deepest_moments_count_more_than_frames(experiment: Path, direct: li
     assert metrics.level in ("WARN", "STALE") and coverage.deepest_compared < coverage.deepest
 
 
-@pytest.mark.parametrize("rate", [None, 4.0], ids=["lock step", "real time"])
-@pytest.mark.parametrize("at", [0, 6])
+@pytest.mark.parametrize(
+    ("at", "rate"),
+    [
+        pytest.param(0, None, marks=pytest.mark.slow, id="0-lock step"),
+        pytest.param(6, None, id="6-lock step"),
+        pytest.param(0, 4.0, id="0-real time"),
+        pytest.param(6, 4.0, marks=pytest.mark.slow, id="6-real time"),
+    ],
+)
 def test_one_bad_stamp_costs_one_frame(
     at: int, rate: float | None, experiment: Path, direct: list[Prediction], tmp_path: Path
 ):

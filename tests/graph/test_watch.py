@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -61,6 +62,62 @@ def test_inputs_that_cannot_be_right_are_said_while_they_come(
 ):
     found = watched(experiment, tmp_path, direct, change)
     assert any(said in text for text in found) if said else not found
+
+
+def test_an_id_that_is_there_twice_is_said_as_results_say_it(experiment: Path, direct: list[Prediction]):
+    """From whichever frame on: markers that results leave out were looked at as if they were two places of one."""
+    watch, ids = LiveWatch(load_experiment(experiment)), direct[0].ids.copy()
+    ids[3] = ids[2]
+    for k, pose in enumerate(small.press(70)):
+        named = ids if k >= 60 else direct[0].ids
+        for topic, kind, data in [
+            *written(lambda w, p=pose, i=named: w.marker_frame(small.frame(p.stamp_ns, i, direct[0].markers))),
+            *written(lambda w, p=pose: w.pose(p)),
+        ]:
+            watch.take(topic, kind, data)
+    (said,) = watch.news()
+    assert said.text.startswith("markers whose id is there twice in a frame are left out: nobody knows which is which")
+    assert said.doubts and said.remedy
+
+
+S = 1_000_000_000
+
+
+@pytest.mark.parametrize(
+    ("seconds", "ahead", "late", "said"),
+    [
+        (40.0, lambda t: 0.0, lambda t: 0.004, False),
+        (40.0, lambda t: 0.25 * (t > 15.0), lambda t: 0.004, True),
+        (40.0, lambda t: 0.0, lambda t: 0.004 + max(15.9 - t, 0.0) * (t > 15.0), False),
+        (10.0, lambda t: 0.0, lambda t: 0.004 + max(1.0 - t, 0.0), False),
+    ],
+    ids=["sound", "the tracker's clock was set", "a queue was full", "a slow start"],
+)
+def test_a_clock_that_was_set_is_said_as_results_say_it(
+    seconds: float,
+    ahead: Callable[[float], float],
+    late: Callable[[float], float],
+    said: bool,
+    experiment: Path,
+    direct: list[Prediction],
+):
+    """By when messages come, of a tracker of 20 Hz beside poses of 50 Hz."""
+    now = {"ns": 0}
+    watch = LiveWatch(load_experiment(experiment), lambda: now["ns"])
+    (frame,) = written(lambda w: w.marker_frame(small.frame(0, direct[0].ids, direct[0].markers)))
+    (pose,) = written(lambda w: w.pose(small.press(2)[0]))
+    sent = [(k / 20.0, ahead(k / 20.0), late(k / 20.0), frame) for k in range(round(20 * seconds))]
+    sent += [(k / 50.0, 0.0, 0.002, pose) for k in range(round(50 * seconds))]
+    for at, before, after, (topic, kind, data) in sorted(sent, key=lambda each: each[0] + each[2]):
+        now["ns"] = small.START_NS + round(S * (at + after))
+        stamp = small.START_NS + round(S * (at + before))
+        watch.take(topic, kind, data[:4] + struct.pack("<iI", stamp // S, stamp % S) + data[12:])
+    texts = [finding.text for finding in watch.news() if "receive time minus stamp" in finding.text]
+    assert len(texts) == said
+    if said:
+        assert texts[0].startswith(
+            "receive time minus stamp of /stereo/markers changes by 0.250 s beside that of /probe"
+        )
 
 
 def test_another_frame_and_a_clock_that_is_set_back_are_said_while_they_come(

@@ -115,7 +115,7 @@ def test_pictures_and_what_is_found_in_them_are_one_recording(filmed: small.Film
     assert results(tmp_path / "one")["recording"]["digest"] == digests[0] != digests[1]
 
 
-@pytest.mark.parametrize("changes", [{"start": 0.25}, {"duration": 0.3}])
+@pytest.mark.parametrize("changes", [{"start": 0.25}, pytest.param({"duration": 0.3}, marks=pytest.mark.slow)])
 def test_a_part_of_a_recording_is_no_take(changes: dict, experiment: Path, bag: Path, tmp_path: Path):
     run(RunOptions(experiment, bag, tmp_path / "part", **changes), silent)
     assert results(tmp_path / "part")["recording"]["whole"] is False
@@ -132,7 +132,8 @@ def test_a_part_of_a_recording_is_no_take(changes: dict, experiment: Path, bag: 
 
 
 def test_what_is_not_played_does_not_judge_what_is(experiment: Path, direct: list[Prediction], tmp_path: Path):
-    """Begun in the middle of a press, nothing was said: the whole recording begins above the body."""
+    """Begun in the middle of a press, a recording is in doubt; of a part of one that begins above the body the model
+    comes there as in a run of the whole, and only what is not recorded is in doubt."""
     bag = recorded(tmp_path / "rec.mcap", measured(direct))
     said: list[str] = []
     run(RunOptions(experiment, bag, tmp_path / "out", start=0.3), lambda text, *_: said.append(text))
@@ -140,9 +141,10 @@ def test_what_is_not_played_does_not_judge_what_is(experiment: Path, direct: lis
     of_cut: list[str] = []
     run(RunOptions(experiment, cut, tmp_path / "of_cut"), lambda text, *_: of_cut.append(text))
     inside = "warning: the recording begins with the probe"
-    assert [x for x in said if x.startswith(inside)] == [x for x in of_cut if x.startswith(inside)] != []
     told, told_of_cut = results(tmp_path / "out"), results(tmp_path / "of_cut")
-    assert told["verdict"] == told_of_cut["verdict"] == "WARN" and told["doubts"] == told_of_cut["doubts"]
+    assert [x for x in of_cut if x.startswith(inside)] != [] and told_of_cut["verdict"] == "WARN"
+    assert len(told_of_cut["doubts"]) == 1
+    assert [x for x in said if x.startswith("warning")] == [] and told["doubts"] == [] and told["verdict"] == "OK"
     whole: list[str] = []
     run(RunOptions(experiment, bag, tmp_path / "whole"), lambda text, *_: whole.append(text))
     assert not any(x.startswith(inside) for x in whole)

@@ -32,6 +32,13 @@ REGISTERED = {**MECHANICAL, **MEASURING}
 
 
 @pytest.mark.parametrize("name", sorted(REGISTERED))
+def test_an_effect_goes_with_the_part_of_an_experiment_that_it_acts_on(name: str):
+    """A fitted model takes those of the body to other probes and cameras, and no others."""
+    parts = {"probe": "probe", "measuring": "stereo"}
+    assert PUBLISHED[name].goes_with == parts.get(REGISTERED[name].INFO.acts_on, "phantom")
+
+
+@pytest.mark.parametrize("name", sorted(REGISTERED))
 def test_a_fit_looks_only_where_values_are_possible(name: str):
     published = {**PUBLISHED[name].parameters, **PUBLISHED[name].optional}
     for parameter in (*REGISTERED[name].INFO.parameters, *REGISTERED[name].INFO.optional):

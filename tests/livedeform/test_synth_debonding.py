@@ -25,7 +25,10 @@ def yields(n, direction, fraction):
     return moved[1] - moved[0]
 
 
-@pytest.mark.parametrize(("direction", "fraction"), [(0.0, 1.0 / 6.0), (0.4, 0.135), (0.8, 0.13), (2.0, 0.15)])
+@pytest.mark.parametrize(
+    ("direction", "fraction"),
+    [(0.0, 1.0 / 6.0), *(pytest.param(*c, marks=pytest.mark.slow) for c in ((0.4, 0.135), (0.8, 0.13), (2.0, 0.15)))],
+)
 def test_a_bond_that_came_loose_is_as_soft_with_elements_half_as_large(direction, fraction):
     coarse, fine = (yields(n, direction, fraction) for n in ((6, 5, 3), (12, 10, 3)))
     print(f"{1e3 * coarse:.3f} and {1e3 * fine:.3f} mm: {coarse / fine:.3f}")

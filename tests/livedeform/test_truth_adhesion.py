@@ -62,9 +62,8 @@ def test_a_ball_pulls_the_same_in_smaller_steps() -> None:
     assert np.abs(one - other).max() < 0.001 * one.max()
 
 
-@pytest.mark.parametrize(
-    "strength", [500.0, pytest.param(1500.0, marks=pytest.mark.slow), pytest.param(4000.0, marks=pytest.mark.slow)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("strength", [500.0, 1500.0, 4000.0])
 def test_a_ball_pulls_by_what_its_work_of_separation_asks_for(strength: float) -> None:
     """Johnson, Kendall & Roberts 1971. Measured 0.83, 0.95 and 0.80 times as much with elements of 10 mm: asked is
     within 0.3."""

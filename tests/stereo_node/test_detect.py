@@ -160,6 +160,37 @@ def test_half_of_a_small_disc_is_not_measured():
             assert len(detect_blobs(noisy, DetectorSettings())) == 0
 
 
+@pytest.mark.parametrize("radius", [1.6, 2.0])
+def test_the_sigma_of_a_tiny_disc_holds_what_a_cut_that_does_not_show_does(radius):
+    """Something as light as the ground cuts it: up to 39 sigmas, and said to be sure."""
+    sigmas = []
+    for seed in range(3):
+        for depth in (0.0, 0.1, 0.2, 0.3, 0.5, 0.7, 1.0):
+            noisy, middle = covered(radius, depth, 180.0, seed)
+            blobs = detect_blobs(noisy, DetectorSettings(min_radius=1.0))
+            for centre, covariance in zip(blobs.centres, blobs.covariances, strict=True):
+                e = centre - middle
+                sigmas.append(np.sqrt(e @ np.linalg.inv(covariance) @ e / 2))
+    assert np.sqrt(np.mean(np.square(sigmas))) < 2.0 and max(sigmas) < 7
+
+
+@pytest.mark.parametrize("radius", [2.5, 4.0, 6.0, 10.0])
+def test_the_centroid_of_a_covered_marker_is_refused_or_its_sigma_holds(radius):
+    """It had no test of what covers a marker: up to 580 sigmas."""
+    sigmas, n_whole = [], 0
+    for seed in range(3):
+        for depth in (0.0, 0.1, 0.2, 0.3, 0.5, 0.7, 1.0):
+            noisy, middle = covered(radius, depth, 180.0, seed)
+            blobs = detect_blobs(noisy, DetectorSettings(centre="moments"))
+            assert not len(blobs) or depth < 0.7 or radius < 4.0
+            for centre, covariance in zip(blobs.centres, blobs.covariances, strict=True):
+                e = centre - middle
+                sigmas.append(np.sqrt(e @ np.linalg.inv(covariance) @ e / 2))
+            n_whole += len(blobs) == 1 and depth == 0.0
+    assert n_whole == 3
+    assert np.sqrt(np.mean(np.square(sigmas))) < 2.0 and max(sigmas) < 5
+
+
 def test_egg_shaped_outlines_show():
     """A rim displaced by 0.3 cos(3 a) px; round ones show nothing beyond noise."""
     v, u = np.mgrid[0 : SIZE[1], 0 : SIZE[0]].astype(float)

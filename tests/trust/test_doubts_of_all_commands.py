@@ -11,18 +11,18 @@ import pytest
 import yaml
 from situations import small
 
+from livedeform.closed_loop.inputs import _force_doubts
 from livedeform.common import topics as t
 from livedeform.common.bags.read import read_bag
 from livedeform.common.bags.recording import load_recording
 from livedeform.common.bags.recording_writer import RecordingWriter
 from livedeform.common.bags.write import BagWriter
-from livedeform.common.checks.probe_path import check_probe
 from livedeform.common.checks.recorded import load_checked
-from livedeform.common.experiment.plausibility import read_body
 from livedeform.common.experiment.yaml_file import Experiment, load_experiment
 from livedeform.common.types import Array, MarkerFrame, Pose, Wrench
 from livedeform.inspection import fit_findings, inspect
 from livedeform.run import replay
+from livedeform.run.results import doubts_of
 
 S = 1_000_000_000
 SECONDS = np.arange(0.0, 9.0, 0.05)
@@ -96,6 +96,11 @@ def clock_set(sent: Sent) -> Sent:
     return replace(sent, ahead=0.25 * (sent.at > 1.0))
 
 
+def force_clock_set(sent: Sent) -> Sent:
+    stamp_ns = sent.wrench.stamp_ns + round(0.25 * S) * (sent.at > 1.0)
+    return replace(sent, wrench=replace(sent.wrench, stamp_ns=stamp_ns))
+
+
 def cameras_moved(sent: Sent) -> Sent:
     places = {0.0: -0.05, 3.0: -0.03}
     return replace(sent, cameras=Pose(0, np.array([places[sent.at], 0.0, 0.35]), DOWN) if sent.at in places else None)
@@ -105,6 +110,7 @@ DOUBTS: dict[str, tuple[Change, str]] = {
     "the wrench was not tared": (untared, "the wrench is not tared: (0.00, 0.00, -1.50) N while the probe is in the"),
     "one id for two markers": (one_id_twice, "markers whose id is there twice in a frame are left out"),
     "the tracker's clock was set": (clock_set, "receive time minus stamp of /stereo/markers changes by 0.250 s beside"),
+    "the force sensor's clock was set": (force_clock_set, "receive time minus stamp of /probe/wrench changes by 0.250"),
     "the cameras were registered anew": (cameras_moved, "/tf_static says anew where the cameras are"),
 }
 
@@ -124,6 +130,10 @@ def test_a_doubt_is_said_by_every_command(name: str, tmp_path: Path, experiment:
     assert found in inspect(bag, tmp_path / "experiment").findings
     (loaded,) = load_checked([bag], [], experiment)
     assert found.text in loaded.warnings
+    of_forces = [found.text] if change in (untared, force_clock_set) else []
+    assert found.of_forces == bool(of_forces) and loaded.force_doubts == of_forces
+    assert doubts_of([found]) == (() if of_forces else (found.text,))  # a run reads no force that was measured
+    assert _force_doubts({"x": loaded}) == [f"x: {text}" for text in of_forces]  # which a diagnosis reads
 
 
 def test_of_a_sound_recording_nothing_is_in_doubt(tmp_path: Path, experiment: Experiment) -> None:
@@ -141,16 +151,28 @@ EFFECTS: dict[str, tuple[list[dict[str, object]], str]] = {
 }
 
 
-def cut(bag: Path, experiment: Experiment, start: float) -> list[str]:
+@dataclass
+class Part:
+    """What is doubted of a recording from the middle on: where the model is led through what came before (``led``),
+    and where it finds no equilibrium there (``lost``); and through how many poses it is led."""
+
+    led: list[str]
+    lost: list[str]
+    n_to_pass: int
+
+
+def cut(bag: Path, experiment: Experiment, start: float) -> Part:
     """What is said to be in doubt of the recording from ``start`` s on."""
     with read_bag(bag) as reader:
-        whole = load_recording(bag, experiment)
-        played = replay.cut(whole, reader, replay.plan(reader, experiment), start, None)
+        whole, plan = load_recording(bag, experiment), replay.plan(reader, experiment)
+        played = replay.cut(whole, reader, plan, start, None)
         assert len(played.arrivals[t.STEREO_MARKERS]) == len(played.marker_frames)
-        found = [*replay.check_cut(whole, played, experiment), *check_probe(played, experiment, read_body(experiment))]
-    found = [f for f in found if f.level != "NOTE"]
-    assert all(f.level == "WARN" and f.doubts for f in found)
-    return [f.text for f in found]
+        beginning = replay.Beginning(whole, played, experiment)
+        fit = fit_findings(reader, experiment, played, is_part=bool(beginning.poses))
+    led = [f for f in [*fit, *beginning.findings(plan)] if f.level != "NOTE"]
+    lost = beginning.left_out()
+    assert all(f.level == "WARN" and f.doubts for f in [*led, *lost])
+    return Part([f.text for f in led], [f.text for f in lost], len(beginning.to_pass))
 
 
 @pytest.mark.parametrize("name", EFFECTS)
@@ -160,11 +182,14 @@ def test_what_a_start_in_the_middle_leaves_out_is_doubted(name: str, tmp_path: P
     document = yaml.safe_load((folder / "experiment.yaml").read_text())
     (folder / "experiment.yaml").write_text(yaml.safe_dump(document | {"effects": effects}))
     experiment, bag = load_experiment(folder), written(tmp_path / "x.mcap")
-    assert cut(bag, experiment, 0.0) == cut(bag, experiment, 1.0) == []
-    between = cut(bag, experiment, 4.5)
+    parts = {start: cut(bag, experiment, start) for start in (0.0, 1.0, 4.5, 6.0)}
+    assert all(part.led == [] for part in parts.values())  # the model comes there as in a run of the whole
+    assert parts[0.0].lost == parts[1.0].lost == []
+    between = parts[4.5].lost
     assert len(between) == bool(reason) and all(reason in text and "--start 4.5 s" in text for text in between)
-    within = cut(bag, experiment, 6.0)
-    assert "begins with the probe" in within[-1] and len(within) == 1 + (name != "elastic")
+    within = parts[6.0].lost
+    assert "begins within a press" in within[0] and len(within) == 1 + (name != "elastic")
+    assert [part.n_to_pass for part in parts.values()] == ([0, 0, 0, 13] if name == "elastic" else [0, 20, 90, 120])
 
 
 def test_a_clock_that_was_set_before_the_start_does_not_matter(tmp_path: Path, experiment: Experiment) -> None:

@@ -120,8 +120,13 @@ def read_inputs(
         recordings=recordings,
         declared=tuple(experiment.effects),
         settings=settings,
-        doubts=doubts,
+        doubts=(*_force_doubts(recordings), *doubts),
     )
+
+
+def _force_doubts(recordings: Mapping[str, Recording]) -> list[str]:
+    """Say why forces of the recordings, which are fitted, may be wrong."""
+    return [f"{name}: {text}" for name, recording in recordings.items() for text in recording.force_doubts]
 
 
 def _load(

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Literal
 
 import numpy as np
 
@@ -87,12 +88,14 @@ def _no_rule(values: Mapping[str, Array], seconds: float, height: float) -> str:
 @dataclass(frozen=True)
 class Published:
     """An effect as users name it: its parameters, those that need not be given (``optional``), and a ``rule`` for what
-    their limits alone do not tell. ``several``: a body may have several, each in a region of its own."""
+    their limits alone do not tell. ``several``: a body may have several, each in a region of its own.
+    ``goes_with``: the part of an experiment that it belongs to, and stays with where others change."""
 
     parameters: Mapping[str, Value]
     rule: Rule = _no_rule
     optional: Mapping[str, Value] = field(default_factory=dict)
     several: bool = False
+    goes_with: Literal["phantom", "probe", "stereo"] = "phantom"
 
 
 def _relaxation(values: Mapping[str, Array], seconds: float, height: float) -> str:
@@ -137,20 +140,24 @@ PUBLISHED: Mapping[str, Published] = {
     "stiffness_gradient": Published({"slope": Value()}, _modulus_by_height),
     "base_slip": Published({"stiffness": Value(NOT_NEGATIVE, off=INFINITE)}),
     "base_debonding": Published({"direction": Value(), "fraction": Value(BELOW_ONE)}),
-    "probe_friction": Published({"mu": Value(NOT_NEGATIVE)}),
-    "probe_adhesion": Published({"strength": Value(NOT_NEGATIVE)}),
+    "probe_friction": Published({"mu": Value(NOT_NEGATIVE)}, goes_with="probe"),
+    "probe_adhesion": Published({"strength": Value(NOT_NEGATIVE)}, goes_with="probe"),
     "gravity_tilt": Published({"angle_x": Value(ANGLE), "angle_y": Value(ANGLE)}),
     "density": Published({"ratio": Value(POSITIVE)}),
     "scan_gravity": Published({"fraction": Value(SHARE)}),
     "late_load": Published({"delay": Value(NOT_NEGATIVE)}),
     "load_friction": Published({"ratio": Value(NOT_NEGATIVE), "give": Value(POSITIVE)}),
-    "stereo_scale": Published({"scale": Value(POSITIVE)}),
-    "camera_motion": Published({"translation": Value(size=3), "rotation": Value(size=3), "onset": Value(NOT_NEGATIVE)}),
-    "lens_distortion": Published({"k1": Value()}),
-    "refraction": Published({"index": Value(Limits(1.0, 4.0, "both"))}),  # of any transparent body against air
-    "time_offset": Published({"seconds": Value()}),
-    "probe_offset": Published({"translation": Value(size=3)}),
-    "reference_pose": Published({"translation": Value(size=3), "rotation": Value(size=3)}),
+    "stereo_scale": Published({"scale": Value(POSITIVE)}, goes_with="stereo"),
+    "camera_motion": Published(
+        {"translation": Value(size=3), "rotation": Value(size=3), "onset": Value(NOT_NEGATIVE)}, goes_with="stereo"
+    ),
+    "lens_distortion": Published({"k1": Value()}, goes_with="stereo"),
+    "refraction": Published(  # of any transparent body against air
+        {"index": Value(Limits(1.0, 4.0, "both"))}, goes_with="stereo"
+    ),
+    "time_offset": Published({"seconds": Value()}, goes_with="probe"),
+    "probe_offset": Published({"translation": Value(size=3)}, goes_with="probe"),
+    "reference_pose": Published({"translation": Value(size=3), "rotation": Value(size=3)}, goes_with="stereo"),
     "inertia": Published({"rayleigh_beta": Value(NOT_NEGATIVE)}),
 }
 

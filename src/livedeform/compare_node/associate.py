@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import asdict, dataclass, field, replace
+from itertools import chain, islice
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,7 @@ from numpy.typing import NDArray
 
 from livedeform.common.stamps import StampClock, StampKind
 from livedeform.common.types import Ids, MarkerFrame, PredictedMarkers
-from livedeform.compare_node.interpolation import InterpolationBound, interpolate, remainder
+from livedeform.compare_node.interpolation import InterpolationBound, interpolate, neighbour, remainder
 from livedeform.compare_node.residual import Residual
 
 __all__ = ["Associator", "Counts", "interpolate", "remainder"]
@@ -78,6 +79,7 @@ class Associator:
         self.interpolation_bound = InterpolationBound()
         self._waiting: deque[MarkerFrame] = deque()
         self._predictions: deque[PredictedMarkers] = deque()
+        self._passed: deque[PredictedMarkers] = deque()  # predictions that no frame will lie between
         self._measured_clock, self._predicted_clock = StampClock(max_gap_ns), StampClock(max_gap_ns)
         self._seen_measured: set[int] = set()
         self._seen_predicted: set[int] = set()
@@ -131,6 +133,7 @@ class Associator:
         if predictions:
             self._count_out_of_order(len(self._predictions))
             self._predictions.clear()
+            self._passed.clear()
             self.interpolation_bound.settle(None)
 
     @property
@@ -161,9 +164,11 @@ class Associator:
             if not ended and not self._predicted_clock.sure_of(self._waiting[0].stamp_ns):
                 break
             frame = self._waiting.popleft()
-            # keep one prediction before the bracket: what interpolation can get wrong is told from it
+            # keep those about the bracket, and aside what tells by how much interpolation can be wrong there
             while len(self._predictions) > 2 and self._predictions[2].stamp_ns < frame.stamp_ns:
-                self._predictions.popleft()
+                self._passed.append(self._predictions.popleft())
+            while len(self._passed) > 1 and self._passed[1].stamp_ns < frame.stamp_ns - 2 * self.max_gap_ns:
+                self._passed.popleft()
             residual = self._match(frame)
             if residual is not None:
                 residuals.append(residual)
@@ -178,6 +183,7 @@ class Associator:
             if not second.converged:
                 self.counts.refused_not_converged += 1
                 return None
+            self.interpolation_bound.add_exact()
             return self._residual(frame, second, 0.0)
         if after == 0:
             self.counts.refused_extrapolation += 1
@@ -189,9 +195,9 @@ class Associator:
         if not (first.converged and second.converged):
             self.counts.refused_not_converged += 1
             return None
-        before = self._predictions[after - 2] if after >= 2 else None
-        following = self._predictions[after + 1] if after + 1 < len(self._predictions) else None
-        self.interpolation_bound.add((before, first, second), following, frame.stamp_ns)
+        nearest_first = chain((self._predictions[i] for i in range(after - 2, -1, -1)), reversed(self._passed))
+        before, later = neighbour(nearest_first, first, second), islice(self._predictions, after + 1, None)
+        self.interpolation_bound.add((before, first, second), later, frame.stamp_ns)
         prediction = interpolate(first, second, frame.stamp_ns)
         return self._residual(frame, prediction, remainder(before, first, second, frame.stamp_ns))
 

@@ -11,19 +11,29 @@ between the line and the lines of its neighbours going on, so that it is off by 
 
     min(|v1 - v0| (t - t0), |v2 - v1| (t1 - t)).
 
-Where they do not, and where only one neighbour is known, the larger remainder is an estimate and no bound.
+Where they change to and fro, as of a marker that is still, moves and is still again, it may follow either line and then
+change over: the larger distance counts, as long as the marker can still change over at five times its mean speed. Where
+only one neighbour is known, its remainder is an estimate and no bound. A neighbour is at least half as far away as the
+bracket is long: the velocity over a shorter time is mostly noise, which the bracket would make as many times larger as
+it is longer.
 """
 
 from __future__ import annotations
 
+from array import array
+from collections.abc import Iterable
+from dataclasses import dataclass
+
 import numpy as np
 
 from livedeform.common.types import Array, Ids, PredictedMarkers
+from livedeform.compare_node.metrics import p95, rmse
 
-__all__ = ["InterpolationBound", "interpolate", "remainder"]
+__all__ = ["Interpolated", "InterpolationBound", "interpolate", "neighbour", "remainder"]
 
+QUICK = 4.0  # of a marker's change of velocity: by how much it is faster at most, within a bracket, than on average
 Bracket = tuple[PredictedMarkers | None, PredictedMarkers, PredictedMarkers]
-"""Two predictions, and the one before them where it is known."""
+"""Two predictions, and a neighbour before them where one is known."""
 
 
 def interpolate(first: PredictedMarkers, second: PredictedMarkers, stamp_ns: int) -> PredictedMarkers:
@@ -41,32 +51,74 @@ def remainder(
     return _largest((before, first, second, None), stamp_ns)
 
 
+def neighbour(
+    others: Iterable[PredictedMarkers], first: PredictedMarkers, second: PredictedMarkers
+) -> PredictedMarkers | None:
+    """Return the first of the ``others``, the nearest first, that is far enough from the bracket of two predictions to
+    tell a velocity beside it; None if none is."""
+    for other in others:
+        away = max(first.stamp_ns - other.stamp_ns, other.stamp_ns - second.stamp_ns)
+        if 2 * away >= second.stamp_ns - first.stamp_ns:
+            return other
+    return None
+
+
+@dataclass(frozen=True)
+class Interpolated:
+    """Say by how much (m) interpolation can have been wrong: ``largest`` in any frame, over the markers, and ``judged``
+    in what is judged of all frames, their rmse and 95th percentile, the larger of the two; NaN where no frame was
+    interpolated, or nothing is known of it."""
+
+    largest: float = float("nan")
+    judged: float = float("nan")
+
+
 class InterpolationBound:
-    """The largest ``value`` (m) by which interpolation can have been wrong so far, over frames and markers; NaN where
-    no frame was interpolated, or nothing is known of it.
+    """Keep by how much interpolation can have been wrong so far, frame by frame.
 
     The prediction after a bracket often comes after its frames: those wait for it here, or for the end.
     """
 
     def __init__(self) -> None:
         self.value = float("nan")
+        """The largest (m) over frames and markers; NaN where no frame was interpolated, or nothing is known of it."""
+        self._bounds = array("d")
         self._waiting: list[tuple[Bracket, int]] = []
 
-    def add(self, bracket: Bracket, after: PredictedMarkers | None, stamp_ns: int) -> None:
-        """Take a frame at ``stamp_ns`` that was interpolated in a ``bracket``; ``after`` None: not known yet."""
+    @property
+    def found(self) -> Interpolated:
+        """Return what is known of all frames so far."""
+        bounds = np.array(self._bounds)
+        if not np.isfinite(self.value):
+            return Interpolated()
+        return Interpolated(self.value, max(rmse(bounds), p95(bounds)))
+
+    def add_exact(self) -> None:
+        """Take a frame that has a prediction of its own."""
+        self._bounds.append(0.0)
+
+    def add(self, bracket: Bracket, later: Iterable[PredictedMarkers], stamp_ns: int) -> None:
+        """Take a frame at ``stamp_ns`` that was interpolated in a ``bracket``, with what is known ``later`` than it."""
+        after = neighbour(later, *bracket[1:])
         if after is None:
             self._waiting.append((bracket, stamp_ns))
         else:
             self._take(bracket, after, stamp_ns)
 
     def settle(self, after: PredictedMarkers | None) -> None:
-        """Take the prediction that came ``after`` the last bracket; None: none comes."""
-        for bracket, stamp_ns in self._waiting:
-            self._take(bracket, after, stamp_ns)
-        self._waiting.clear()
+        """Take a prediction that came ``after`` the last bracket; None: no more come."""
+        waiting, self._waiting = self._waiting, []
+        for bracket, stamp_ns in waiting:
+            if after is None or neighbour([after], *bracket[1:]) is not None:
+                self._take(bracket, after, stamp_ns)
+            else:
+                self._waiting.append((bracket, stamp_ns))
 
     def _take(self, bracket: Bracket, after: PredictedMarkers | None, stamp_ns: int) -> None:
-        self.value = float(np.fmax(self.value, _largest((*bracket, after), stamp_ns)))
+        bound = _largest((*bracket, after), stamp_ns)
+        if np.isfinite(bound):
+            self.value = float(np.fmax(self.value, bound))
+            self._bounds.append(bound)
 
 
 def _largest(
@@ -89,8 +141,9 @@ def _largest(
     out = np.maximum(off[0], off[-1])
     if len(there) == 4:
         before, after = velocity[1] - velocity[0], velocity[2] - velocity[1]
-        between = np.minimum(np.abs(before) * s, np.abs(after) * left)
-        out = np.where(before * after >= 0.0, between, out)
+        one_way = np.minimum(np.abs(before) * s, np.abs(after) * left)
+        to_and_fro = np.maximum(np.abs(before) * min(s, QUICK * left), np.abs(after) * min(left, QUICK * s))
+        out = np.where(before * after >= 0.0, one_way, to_and_fro)
     return float(np.nanmax(np.linalg.norm(out, axis=1)))
 
 

@@ -11,7 +11,7 @@ from livedeform.compare_node.metrics import Level, RunMetrics
 from livedeform.compare_node.surface_error import SurfaceError
 
 ENOUGH, HALF = 0.9, 0.5  # of the measured frames, and of the deepest moments: below it WARN at best, and STALE
-MATTERS = 0.5  # of the threshold, by which interpolation can have been wrong: what is over it may be within, or not
+MATTERS = 0.5  # of the threshold, by which interpolation can have changed what is judged: it may be within, or not
 SMALL = 0.0095  # mm, below which two decimals are 0.01 or 0.00
 REFUSED = {
     "extrapolation": "before the first or after the last prediction",
@@ -118,11 +118,9 @@ def _doubts(metrics: RunMetrics) -> list[str]:
     """Return what keeps the verdict from being OK."""
     c = metrics.coverage
     out = list(metrics.doubts)
-    if metrics.interpolation_bound > MATTERS * metrics.threshold:
-        out.append(
-            f"interpolation between predictions may be wrong by up to {_mm(metrics.interpolation_bound)} mm: record "
-            "the poses more often"
-        )
+    if _interpolated_by(metrics) > MATTERS * metrics.threshold:
+        bound = f"interpolation between predictions may be wrong by up to {_mm(metrics.interpolation_bound)} mm"
+        out.append(f"{bound}: {_more_predictions(c)}")
     if c is None:
         return out
     if c.interrupted:
@@ -134,6 +132,23 @@ def _doubts(metrics: RunMetrics) -> list[str]:
     if c.presses_compared < c.presses:
         out.append(f"only {c.presses_compared} of {c.presses} presses were compared")
     return out
+
+
+def _interpolated_by(metrics: RunMetrics) -> float:
+    """Return by how much (m) interpolation can have changed the rmse or the 95th percentile; in a run that does not say
+    it, by how much in any frame."""
+    judged = metrics.interpolation_judged
+    return judged if np.isfinite(judged) else metrics.interpolation_bound
+
+
+def _more_predictions(coverage: Coverage | None) -> str:
+    """Say how predictions get closer together: where poses were overtaken, recording more of them helps nothing."""
+    if coverage is None or not coverage.skipped:
+        return "record the poses more often"
+    return (
+        f"{coverage.skipped} poses were overtaken by newer ones: run the recording at `--rate max` or with larger "
+        "elements, or else record the poses more often"
+    )
 
 
 def _notes(metrics: RunMetrics) -> list[str]:

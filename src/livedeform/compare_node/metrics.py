@@ -110,6 +110,8 @@ class RunMetrics:
     recording's ends; ``takes``: what this and other takes let expect of the next, where others were given;
     ``surface``: distances of points without ids, where they were measured; ``places``: the rmse (m) that the stated
     uncertainty of the markers' places alone would leave, which the intervals have in them; 0 where none is stated.
+    ``interpolation_judged`` (m) is by how much interpolation can have changed what is judged, ``interpolation_bound``
+    by how much in any frame (`interpolation.Interpolated`); NaN where it is not known.
     """
 
     n: int
@@ -133,6 +135,7 @@ class RunMetrics:
     takes: Takes | None = None
     surface: SurfaceError | None = None
     places: float = 0.0
+    interpolation_judged: float = float("nan")
 
     @property
     def relative(self) -> float:

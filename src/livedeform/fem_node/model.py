@@ -167,9 +167,12 @@ class PhantomModel:
         delay = 0.0 if self.physics.probe is None else self.physics.probe.time_offset
         return 0 if pose is None else pose.stamp_ns - round(1e9 * delay)
 
-    def _timeline(self, start_ns: int, clock_ns: int, *, pressed: bool) -> Timeline:
+    def _timeline(
+        self, start_ns: int, clock_ns: int, *, pressed: bool, sensitivities: Sequence[Direction] = ()
+    ) -> Timeline:
         physics, memory = self.physics, self.mechanics.memory
-        delays = tuple(sorted({load.delay for load in physics.loads}))
+        beside = [] if memory.rings else [direction.physics for direction in sensitivities]  # motion needs none
+        delays = tuple(sorted({load.delay for each in (physics, *beside) for load in each.loads}))
         hung = bool(memory.hung) and not pressed
         return Timeline(start_ns, clock_ns, physics.release, dynamic=bool(memory.rings), hung=hung, delays=delays)
 
@@ -218,7 +221,7 @@ class PhantomModel:
         shapes = self._shapes.along(self.physics, self.mechanics.unloaded, sensitivities)
         walk = Walk(
             self.mechanics,
-            self._timeline(first, clock_ns, pressed=bool(poses)),
+            self._timeline(first, clock_ns, pressed=bool(poses), sensitivities=sensitivities),
             PoseTrack(poses).at if poses else None,
             sensitivities=sensitivities_of(self.mechanics, sensitivities, shapes, walk_settings.corrections),
             warm=warm,

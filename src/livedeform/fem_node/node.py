@@ -47,7 +47,8 @@ class FemNode(CountingNode):
         self._is_live = settings.newest_only
         self._requests = make_requests(settings.trigger, probe is not None, probe.time_offset if probe else 0.0)
         self.subscribe(PoseStamped, t.PROBE_POSE, self.on_pose, quality, gate=True)
-        self.subscribe(PointCloud2, t.STEREO_MARKERS, self.on_measured, quality, gate=True)
+        measured = t.STEREO_MARKERS_RAW if settings.raw_first else t.STEREO_MARKERS
+        self.subscribe(PointCloud2, measured, self.on_measured, quality, gate=True)
         self.subscribe(PointCloud2, t.STEREO_SURFACE, self.on_measured, quality, gate=True)
         self._rest_first = settings.rest_first or settings.newest_only  # in real time the kernels are warm at once
 

@@ -13,7 +13,8 @@ class Parameters:
     measured "frames" (poses interpolated), or there with "no_poses" (auto: by the experiment). ``newest_only``: skip
     poses that come faster than the model solves. ``best_effort``: hear unreliable publishers. ``start_ns``: the start
     (0: the first stamp). ``rest_first``: publish the surface at rest first. ``mesh_period``: s between ``/fem/mesh``.
-    ``expected``: bag of poses to prepare for. ``after``: bags (apart by ":") of what the body went through before."""
+    ``expected``: bag of poses to prepare for. ``after``: bags (apart by ":") of what the body went through before.
+    ``raw_first``: measured frames are those of ``/stereo/markers_raw``, whose correction waits for the surface."""
 
     experiment: str = ""
     trigger: str = "auto"
@@ -24,3 +25,4 @@ class Parameters:
     mesh_period: float = within(0.1, 0.0, 3600.0)
     expected: str = ""
     after: str = ""
+    raw_first: bool = False

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import pairwise
 from typing import Literal
 
@@ -11,15 +12,19 @@ from livedeform.common import topics as t
 from livedeform.common.bags.read import BagReader
 from livedeform.common.bags.recording import Recording, Stamps, header_stamp_ns
 from livedeform.common.bags.types import RawMessage, decode
-from livedeform.common.checks.beginning import begins_inside, check_start
+from livedeform.common.checks.beginning import check_left_out, check_start, last_clear
 from livedeform.common.checks.finding import Finding
+from livedeform.common.checks.probe_path import ProbeRecord, check_probe
+from livedeform.common.checks.recorded import POSES_APART_NS
 from livedeform.common.errors import InputError, RecordingError
 from livedeform.common.experiment.plausibility import read_body
 from livedeform.common.experiment.yaml_file import Experiment
 from livedeform.common.stamps import APART_NS, bad_stamps
+from livedeform.common.types import Pose
+from livedeform.comparing.identity import is_part
 from livedeform.fem_node.declared import declared_physics
 from livedeform.fem_node.effects import apply_effects
-from livedeform.fem_node.physics.memory import memory_of
+from livedeform.fem_node.physics.memory import Memory, memory_of
 from livedeform.stereo_node.effects import EFFECTS
 
 Measured = Literal["images", "markers", "surface"]
@@ -208,17 +213,70 @@ def _kept(came: Stamps, stamps: set[int]) -> Stamps:
     return [pair for pair in came if pair[0] in stamps]
 
 
-def check_cut(whole: Recording, played: Recording, experiment: Experiment) -> list[Finding]:
-    """Doubt a part of a ``whole`` recording that is ``played`` alone, where it begins within a press, or after what the
-    model would remember."""
-    if not played.poses or played.poses[0].stamp_ns == whole.poses[0].stamp_ns:
-        return []
-    memory = memory_of(apply_effects(declared_physics(experiment), experiment.effects))
-    lasting = [reason for reason in memory.path_dependent if reason not in memory.rubs]
-    start = 1e-9 * (played.poses[0].stamp_ns - whole.start_ns)
-    body = read_body(experiment)
-    said = begins_inside(played, experiment, body)
-    return check_start(whole, experiment, body, start, lasting, memory.rubs, said=said)
+@dataclass(frozen=True)
+class Beginning:
+    """A ``whole`` recording and the part of it that is ``played``: what comes before that is the beginning, which is
+    empty where both begin together."""
+
+    whole: Recording
+    played: Recording
+    experiment: Experiment
+
+    @cached_property
+    def poses(self) -> list[Pose]:
+        """Return the probe's poses before the first that is played."""
+        first_ns = self.played.poses[0].stamp_ns if self.played.poses else 0
+        return [pose for pose in self.whole.poses if pose.stamp_ns < first_ns]
+
+    @cached_property
+    def seconds(self) -> float:
+        """Return how long (s) after the whole recording began the first pose is played."""
+        return 1e-9 * (self.played.poses[0].stamp_ns - self.whole.start_ns) if self.played.poses else 0.0
+
+    @cached_property
+    def _probe(self) -> ProbeRecord:
+        return ProbeRecord(self.whole, self.experiment, read_body(self.experiment))
+
+    @cached_property
+    def _memory(self) -> Memory:
+        return memory_of(apply_effects(declared_physics(self.experiment), self.experiment.effects))
+
+    @property
+    def _lasting(self) -> list[str]:
+        """Return why the model remembers what was before the probe let go."""
+        return [reason for reason in self._memory.path_dependent if reason not in self._memory.rubs]
+
+    @cached_property
+    def to_pass(self) -> list[Pose]:
+        """Return the poses through which the model is led before it predicts: all that it remembers, and of a body that
+        does not, the press that is under way, which may lead to one of several answers."""
+        if self._memory.path_dependent or not self.poses:
+            return self.poses
+        clear_ns = self.whole.start_ns + round(1e9 * last_clear(self._probe, self.seconds))
+        return [pose for pose in self.poses if pose.stamp_ns >= clear_ns]
+
+    def findings(self, plan: Plan) -> list[Finding]:
+        """Check the probe's path, and doubt cameras that are registered while the body is pressed; and a beginning that
+        the model would remember, where the recording is a run of a part and does not hold it."""
+        if not self.poses:
+            return self._not_held()
+        stereo = self.experiment.stereo
+        registers = plan.measured == "images" and (stereo is None or isinstance(stereo.pose, str))
+        return [*check_probe(self._probe), *check_start(self._probe, self.seconds, registers=registers)]
+
+    def _not_held(self) -> list[Finding]:
+        late_ns = self.played.poses[0].stamp_ns - self.whole.start_ns if self.played.poses else 0
+        reasons = ", ".join(self._lasting)
+        if not is_part(self.whole.metadata) or late_ns < POSES_APART_NS or not reasons:
+            return []
+        text = (
+            f"it is a run from {1e-9 * late_ns:.3g} s on, without what the model would remember of before ({reasons})"
+        )
+        return [Finding("WARN", text, "run the recording that was run, with --start", doubts=True)]
+
+    def left_out(self) -> list[Finding]:
+        """Doubt a model that could not be led through all of it, where that matters."""
+        return check_left_out(self._probe, self.seconds, self._lasting, self._memory.rubs)
 
 
 def messages(bag: BagReader, plan: Plan, start: float = 0.0, duration: float | None = None) -> Iterator[RawMessage]:

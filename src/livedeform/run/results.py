@@ -16,6 +16,7 @@ from livedeform.common.experiment.yaml_file import Experiment
 from livedeform.common.types import Array
 from livedeform.compare_node.at_rest import at_rest
 from livedeform.compare_node.coverage import Coverage, cover
+from livedeform.compare_node.interpolation import Interpolated
 from livedeform.compare_node.judgement import judge
 from livedeform.compare_node.metrics import RunMetrics, Statistic, run_metrics
 from livedeform.compare_node.places import with_places
@@ -41,7 +42,7 @@ def write_results(
     experiment: Experiment,
     counts: Mapping[str, Any],
     start_ns: int,
-    interpolation_bound: float,
+    interpolated: Interpolated,
     about: Mapping[str, Any],
     findings: Sequence[Finding] = (),
     recording: Recording | None = None,
@@ -49,9 +50,8 @@ def write_results(
 ) -> RunMetrics:
     """Both files, from ``out/run.mcap``; ``about`` goes into the JSON's head. They are the same for the same run.
 
-    ``findings`` about the inputs, and what the stereo node says of its measurement, keep the verdict from being OK
-    where they doubt it, and make it STALE where they are errors. ``recording`` is ``out/run.mcap`` where it was loaded
-    already; ``repeats`` are runs of other takes.
+    ``findings`` about the inputs and what the stereo node says keep the verdict from being OK where they doubt it, and
+    make it STALE where they are errors. ``recording`` is ``out/run.mcap`` if that is loaded; ``repeats``: other takes.
     """
     recording = recording or load_recording(out / "run.mcap", experiment)
     residuals = residuals_of(recording)
@@ -61,9 +61,10 @@ def write_results(
     counts, findings = with_reasons(counts, said), [*findings, *said.findings]
     metrics = replace(
         metrics,
-        interpolation_bound=interpolation_bound,
+        interpolation_bound=interpolated.largest,
+        interpolation_judged=interpolated.judged,
         coverage=_coverage(recording, residuals, metrics.noise_floor, counts, bool(about.get("interrupted"))),
-        doubts=tuple(dict.fromkeys(f.text for f in findings if f.doubts and f.level != "ERROR")),
+        doubts=doubts_of(findings),
         wrong=tuple(dict.fromkeys(f.text for f in findings if f.level == "ERROR")),
         rest=at_rest(residuals, experiment.markers, _elements_error(about), recording.predicted_wrenches),
         surface=replace(surfaces[0], registration=_registration(about)) if surfaces is not None else None,
@@ -129,6 +130,11 @@ def _coverage(
     )
 
 
+def doubts_of(findings: Sequence[Finding]) -> tuple[str, ...]:
+    """Return what keeps a run's verdict from being OK: not that of measured forces, which it does not read."""
+    return tuple(dict.fromkeys(f.text for f in findings if f.doubts and not f.of_forces and f.level != "ERROR"))
+
+
 def metrics_document(metrics: RunMetrics) -> dict[str, Any]:
     """``metrics.json``: lengths in m, ``interval_95`` the 95 % intervals of the values in ``error``, and what they are
     of."""
@@ -156,6 +162,7 @@ def metrics_document(metrics: RunMetrics) -> dict[str, Any]:
         "places": metrics.places,
         "rest": [asdict(r) | {"contradicts": r.contradicts, "text": r.text} for r in metrics.rest],
         "interpolation_bound": metrics.interpolation_bound,
+        "interpolation_judged": metrics.interpolation_judged,
         "worst_stamp_ns": metrics.worst_stamp_ns,
         "markers": [asdict(marker) for marker in metrics.markers],
     }

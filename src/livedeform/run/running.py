@@ -17,7 +17,7 @@ import yaml
 from livedeform import outputs
 from livedeform.common import topics as t
 from livedeform.common.bags.read import BagReader, read_bag
-from livedeform.common.bags.recording import BEGINS, Recording, load_recording, own_name, stamp_range
+from livedeform.common.bags.recording import BEGINS, load_recording, own_name, stamp_range
 from livedeform.common.checks.finding import Finding, refuse_errors
 from livedeform.common.checks.recorded import check_recording
 from livedeform.common.errors import InputError
@@ -35,13 +35,15 @@ from livedeform.common.experiment.yaml_file import (
 from livedeform.common.processes import uninterrupted
 from livedeform.common.ros.node import CountingNode
 from livedeform.common.ros.session import StopFlag, ros
+from livedeform.common.types import Pose
+from livedeform.compare_node.interpolation import Interpolated
 from livedeform.compare_node.metrics import RunMetrics
 from livedeform.compare_node.node import CompareNode
 from livedeform.compare_node.surface_error import SURFACE_CSV
 from livedeform.comparing.identity import DIGEST, PART, digest_of, is_part
 from livedeform.comparing.takes import Take, read_model, read_repeats, refuse_other_meshes
 from livedeform.fem_node.node import FemNode
-from livedeform.fem_node.path.load_history import earlier_poses, joined, remembers_for_good
+from livedeform.fem_node.path.load_history import earlier_poses, joined, pass_beginning, remembers_for_good
 from livedeform.inspection import fit_findings
 from livedeform.run import graph as g
 from livedeform.run import replay
@@ -100,11 +102,13 @@ class Source:
 
 @dataclass(frozen=True)
 class Nodes:
-    """The nodes of a graph; None where one is not needed, or runs in another process."""
+    """The nodes of a graph; None where one is not needed, or runs in another process. The model found no equilibrium at
+    ``n_missed`` of the poses before the part that is run."""
 
     stereo: StereoNode | None
     fem: FemNode | None
     compare: CompareNode | None
+    n_missed: int = 0
 
     def present(self) -> list[CountingNode]:
         return [node for node in (self.stereo, self.fem, self.compare) if node is not None]
@@ -136,8 +140,8 @@ class Nodes:
         return {"digest": report.digest, "repairs": list(report.repairs), "report": report.lines()}
 
     @property
-    def interpolation_bound(self) -> float:
-        return self.compare.associator.interpolation_bound.value if self.compare is not None else float("nan")
+    def interpolated(self) -> Interpolated:
+        return self.compare.associator.interpolation_bound.found if self.compare is not None else Interpolated()
 
 
 def run(options: RunOptions, tell: Tell) -> RunMetrics:
@@ -158,21 +162,23 @@ def run_into(options: RunOptions, tell: Tell) -> tuple[RunMetrics, Path]:
     inputs = [*files_of(experiment), options.bag, options.model, *options.after, *options.repeats]
     prepared = outputs.prepared(options.out, WRITES, force=options.force, inputs=inputs)
     with prepared as draft, read_bag(options.bag) as bag:
-        plan, recording, findings = _checked(bag, experiment, options, tell)
+        plan, beginning, findings = _checked(bag, experiment, options, tell)
         start_ns, _ = stamp_range(bag)
         ran_of = Source(digest_of(bag), whole=_plays_all(bag, plan, options))
         repeats = _before_it_begins(options, experiment, draft, start_ns, ran_of)
         outputs.write_configuration(draft, about := outputs.configuration("run", asdict(options)))
         with isolated(), ros([]) as stop:
-            nodes = make_nodes(draft / "experiment.yaml", plan, replace(options, out=draft), start_ns, tell)
+            asked, earlier = replace(options, out=draft), beginning.to_pass
+            nodes = make_nodes(draft / "experiment.yaml", plan, asked, start_ns, tell, earlier)
+            findings += _left_out(beginning, nodes, tell)
             refuse_other_meshes(repeats, str(nodes.mesh.get("digest", "")))
             described = metadata(about, draft, start_ns) | ran_of.metadata
-            counts = _replay(bag, plan, replace(options, out=draft), nodes, described, stop, tell)
-            bound, mesh, cut = nodes.interpolation_bound, nodes.mesh, bool(stop)  # what comes later cuts nothing
+            counts = _replay(bag, plan, asked, nodes, described, stop, tell)
+            bound, mesh, cut = nodes.interpolated, nodes.mesh, bool(stop)  # what comes later cuts nothing
             with uninterrupted():
                 ran = load_recording(draft / "run.mcap", experiment)
             if nodes.fem is not None and not cut:
-                told = elements(nodes.fem.model, ran.predictions, recording.poses, start_ns, tell)
+                told = elements(nodes.fem.model, ran.predictions, beginning.played.poses, start_ns, tell)
                 mesh, findings = told.described(mesh), [*findings, *told.findings]
             head = _head(experiment, options.bag.name, cut, mesh, ran_of) | registration_of(bag)
             with uninterrupted():
@@ -200,20 +206,30 @@ def model_of(experiment: Path, model: Path | None, tell: Tell, recording: str | 
 
 def _checked(
     bag: BagReader, experiment: Experiment, options: RunOptions, tell: Tell
-) -> tuple[replay.Plan, Recording, list[Finding]]:
-    """Return what is played, and how it serves the experiment; refuses what does not, and says what is in doubt."""
+) -> tuple[replay.Plan, replay.Beginning, list[Finding]]:
+    """Return what is played, what came before that, and how it serves the experiment; refuses what does not, and says
+    what is in doubt."""
     plan = replay.plan(bag, experiment, at_frames=options.at_frames)
     _refuse_empty(plan, options)
     whole = load_recording(options.bag, experiment)
-    recording = replay.cut(whole, bag, plan, options.start, options.duration)
-    found = [*fit_findings(bag, experiment, recording), *replay.check_cut(whole, recording, experiment)]
-    findings = list(dict.fromkeys(found))
+    played = replay.cut(whole, bag, plan, options.start, options.duration)
+    beginning = replay.Beginning(whole, played, experiment)
+    fit = fit_findings(bag, experiment, played, is_part=bool(beginning.poses))
+    findings = list(dict.fromkeys([*fit, *beginning.findings(plan)]))
     refuse_errors(findings, str(options.bag))
     if options.rate is not None:
         replay.refuse_pauses(bag, plan)
     for warning in dict.fromkeys([*plan.warnings, *(f.text for f in findings if f.level == "WARN")]):
         tell(f"warning: {warning}")
-    return plan, recording, findings
+    return plan, beginning, findings
+
+
+def _left_out(beginning: replay.Beginning, nodes: Nodes, tell: Tell) -> list[Finding]:
+    """Doubt a model that found no equilibrium somewhere before the part that is run, and say so."""
+    found = beginning.left_out() if nodes.n_missed else []
+    for finding in found:
+        tell(f"warning: {finding.text}")
+    return found
 
 
 def _plays_all(bag: BagReader, plan: replay.Plan, options: RunOptions) -> bool:
@@ -248,19 +264,24 @@ def _refuse_empty(plan: replay.Plan, options: RunOptions) -> None:
         )
 
 
-def make_nodes(experiment: Path, plan: replay.Plan, options: RunOptions, start_ns: int, tell: Tell) -> Nodes:
-    """The nodes that the plan needs. The model comes first: the cameras are registered to its markers at rest."""
+def make_nodes(
+    experiment: Path, plan: replay.Plan, options: RunOptions, start_ns: int, tell: Tell, earlier: Sequence[Pose] = ()
+) -> Nodes:
+    """Make the nodes that the plan needs. The model comes first, and goes through the ``earlier`` poses of the
+    recording: the cameras are registered to its markers at rest."""
     lock_step = options.rate is None
     expected = "" if lock_step else str(options.bag)
-    common = {"experiment": str(experiment), "start_ns": start_ns, "best_effort": False}
+    raw_first = plan.corrected and plan.trigger != "poses"  # a frame is seen through the surface of its own moment
+    common = {"experiment": str(experiment), "start_ns": start_ns, "best_effort": False, "raw_first": raw_first}
     fem = FemNode(
         common
         | {"trigger": plan.trigger, "newest_only": not lock_step, "rest_first": plan.corrected, "expected": expected}
         | {"after": joined(options.after)},
         tell,
     )
+    n_missed = pass_beginning(fem.model, earlier, tell)
     rest = ""
-    is_another = bool(options.after) and remembers_for_good(fem.model.physics)
+    is_another = bool(options.after or earlier) and remembers_for_good(fem.model.physics)
     if (plan.measured == "images" or plan.corrected) and needs_rest(fem.experiment, is_another=is_another):
         rest = str(options.out / "rest_markers.csv")
         write_rest(fem, Path(rest))
@@ -269,12 +290,11 @@ def make_nodes(experiment: Path, plan: replay.Plan, options: RunOptions, start_n
         source = "pictures" if plan.measured == "images" else "markers"
         place = recorded_camera_pose(options.bag) if source == "markers" else ""
         asked = {"source": source, "rest_markers": rest, "camera_pose": place, "lone_after": 0.0}
-        follows = {} if plan.trigger == "poses" else {"surface_wait": 0.0}  # a prediction follows its frame
-        stereo = StereoNode(common | asked | follows)
+        stereo = StereoNode(common | asked)
     compare = CompareNode(
         {"experiment": str(experiment), "stale_after": 0.0 if lock_step else 2.0, "best_effort": False}
     )
-    return Nodes(stereo, fem, compare)
+    return Nodes(stereo, fem, compare, n_missed)
 
 
 def needs_rest(experiment: Experiment, *, is_another: bool = False) -> bool:
@@ -476,7 +496,7 @@ def live(
                     *(_several(topic, n) for topic, n in counts["publishers"].items()),
                 ]
                 head = _head(experiment, "live", False, nodes.mesh, _heard(draft / "run.mcap"))
-                begin_ns, bound = recording.start_ns, nodes.interpolation_bound  # by stamps, maybe of another clock
+                begin_ns, bound = recording.start_ns, nodes.interpolated  # by stamps, maybe of another clock
                 metrics = write_results(draft, experiment, counts, begin_ns, bound, head, findings, recording)
         write_report(draft, experiment, tell)
     return metrics

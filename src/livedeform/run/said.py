@@ -48,13 +48,23 @@ class Said:
 
     @property
     def findings(self) -> list[Finding]:
-        """Doubt what was measured where that was said of more than a tenth of it; that markers are few, as where the
-        probe hides them, of more than half."""
-        return [
-            Finding("WARN", f"stereo_node says of {n} of {self.n} frames: {self.text[kind]}", doubts=True)
-            for kind, n in self.times.most_common()
-            if n > (HALF if kind in self.few else SHARE) * self.n
+        """Doubt what was measured where that was said of more than a tenth of it, whatever the errors are; that markers
+        are few, as where the probe hides them, of more than half."""
+        wrong = Counter({kind: n for kind, n in self.times.items() if kind not in self.few})
+        few = [kind for kind in self.few if self.times[kind] > HALF * self.n]
+        often = [kind for kind, n in wrong.items() if n > SHARE * self.n]
+        said = [
+            self._said(kind, self.times[kind]) for kind in sorted([*often, *few], key=lambda kind: -self.times[kind])
         ]
+        if not often and wrong.total() > SHARE * self.n:
+            most, n = wrong.most_common(1)[0]
+            said.append(
+                self._said(most, min(wrong.total(), self.n), f"{len(wrong)} kinds of faults, most often ({n}): ")
+            )
+        return [Finding("WARN", text, doubts=True) for text in said]
+
+    def _said(self, kind: str, n: int, about: str = "") -> str:
+        return f"stereo_node says of {n} of {self.n} frames: {about}{self.text[kind]}"
 
 
 def stereo_said(bag_path: Path) -> Said:

@@ -29,7 +29,8 @@ class StereoParameters:
     ``model_prior``: look for markers that come back where ``/fem/markers`` predicts them, as far as the markers that
     are seen agree. ``model_prior_age``: s by which that prediction may be older or newer than the pictures.
     ``surface_wait``: s that a frame waits for the surface that is predicted at its moment, where a refraction is
-    corrected; 0 where ``fem_node`` predicts at frames. Without a probe none waits.
+    corrected. Without a probe none waits, as predictions follow the corrected frames; save with ``raw_first``:
+    ``fem_node`` predicts at frames before they are corrected. Without that it is to be 0 where predictions follow.
     """
 
     experiment: str = ""
@@ -44,6 +45,7 @@ class StereoParameters:
     model_prior: bool = False
     model_prior_age: float = within(0.2, 0.0, 10.0)
     surface_wait: float = within(0.5, 0.0, 10.0)
+    raw_first: bool = False
 
     def picture_pairs(self) -> PicturePairs:
         """Return what pairs the pictures."""
@@ -55,7 +57,7 @@ class StereoParameters:
 
     def correction(self, experiment: Experiment, rest: Array | None) -> MeasuringCorrection:
         """Return what takes the experiment's measuring effects out of markers that are at ``rest`` (n, 3) m."""
-        wait = 0.0 if experiment.probe is None else self.surface_wait
+        wait = 0.0 if experiment.probe is None and not self.raw_first else self.surface_wait
         return MeasuringCorrection(experiment, self.start_ns, parse_pose(self.camera_pose), rest, wait)
 
     def prior(self, ids: Ids) -> ModelPrior:

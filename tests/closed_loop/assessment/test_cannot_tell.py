@@ -59,7 +59,7 @@ def in_both(seed: int, ratio: float) -> Diagnosis:
     return investigate(toy.ToyModel(toy.ToyBody(PLACES)), toy_inputs(fit, test, NAMES))
 
 
-@pytest.mark.parametrize("seed", [5, 9, 15])
+@pytest.mark.parametrize("seed", [5, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (9, 15))])
 def test_where_nothing_was_added_all_recordings_show_what_those_that_were_fitted_hide(seed):
     result = in_both(seed, 1.0)
     hidden = visible(result.selection, np.inf, toy.SETTINGS).hidden
@@ -68,7 +68,7 @@ def test_where_nothing_was_added_all_recordings_show_what_those_that_were_fitted
         assert result.detectable[name].moves < result.matters
 
 
-@pytest.mark.parametrize("seed", [17, 18])
+@pytest.mark.parametrize("seed", [17, pytest.param(18, marks=pytest.mark.slow)])
 def test_what_all_recordings_speak_for_and_those_that_were_fitted_do_not_is_told(seed):
     """It would move the markers by a size that matters: `none` would be wrong, and there is nothing to hold out."""
     result = in_both(seed, 1.4)
@@ -118,9 +118,10 @@ def test_good_recordings_decide_and_say_how_small():
     assert all(n.interval[0] <= n.value <= n.interval[1] and n.source == "unshared motion" for n in noise)
 
 
+@pytest.mark.statistical
 @pytest.mark.parametrize(
     ("name", "draws"),
-    [("stiffness", 40), pytest.param("viscoelasticity", 200, marks=pytest.mark.statistical)],
+    [("stiffness", 40), ("viscoelasticity", 200)],
 )
 def test_the_detectable_size_is_seen_in_95_of_100(name, draws):
     """Measured over 40 draws: 0.95 to 1.00 of five effects, with a family of 16."""

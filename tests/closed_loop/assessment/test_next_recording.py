@@ -71,6 +71,7 @@ def test_one_recording_says_nothing_of_another():
     assert next_recording(one, one) is None
 
 
+@pytest.mark.slow
 def test_parts_of_what_was_fitted_say_nothing_of_another_recording():
     """Without --test, two recordings: it was "another recording like these 2", from parts that were laid down and
     registered with what was fitted."""

@@ -42,7 +42,10 @@ def test_what_gains_nothing_is_no_rival(effect: object) -> None:
 @pytest.mark.parametrize(
     "first", [toy.effect("gravity_tilt", angle_x=0.08, angle_y=0.03), toy.effect("viscoelasticity", g=[0.3], tau=[2.0])]
 )
-@pytest.mark.parametrize("second", [toy.effect("stiffness", ratio=1.1), toy.effect("density", ratio=1.0 / 1.1)])
+@pytest.mark.parametrize(
+    "second",
+    [toy.effect("stiffness", ratio=1.1), pytest.param(toy.effect("density", ratio=1.0 / 1.1), marks=pytest.mark.slow)],
+)
 def test_each_effect_has_its_own_rivals(first: EffectValues, second: EffectValues) -> None:
     """Without a force a body that is stiffer and one that is lighter move alike, whatever else is the matter: that was
     said where one of them was the first effect, and not where it was the second."""

@@ -105,13 +105,13 @@ def test_an_error_that_lasts_is_not_seen_again_at_every_moment():
     points = np.zeros((k, m, 3))
     rows = rows_of(points, None, np.zeros(k, int))
     cov = np.broadcast_to(np.eye(3) * sigma**2, (k, m, 3, 3))
-    looks = np.repeat([0, 1], k // 2)
+    looks = np.repeat([[0], [1]], k // 2, axis=0) + np.zeros(m, int)
     jump = np.zeros((k, m, 3))
     jump[k // 2 :, 3, 0] = 2.0 * sigma
     r = rows.take(jump)
 
     def size(share: float) -> float:
-        steady = Steady(looks, (1.0 - share) * cov)
+        steady = Steady(looks, np.sqrt((1.0 - share) * cov))
         errors = ModelErrors(np.full(m, 1e-7))
         C = covariance_of(
             rows, share * cov, np.zeros((k, m)), np.zeros(k, int), errors, steady=steady, settings=ALLOWANCE

@@ -279,7 +279,7 @@ def test_a_base_that_begins_to_come_free_is_seen_on_springs_too(slips):
     assert cosine > 0.85  # measured 0.905, 0.950
 
 
-@pytest.mark.parametrize("direction", [0.0, 2.0])
+@pytest.mark.parametrize("direction", [0.0, pytest.param(2.0, marks=pytest.mark.slow)])
 def test_what_comes_free_moves_markers_by_the_power_that_its_card_says(direction):
     """Up to its kick, along the secant to which columns are taken."""
     o, body = phantom.moments([0.5]), Body(phantom.setting(4, probe=None, gravity=np.array([3.0, 0.0, -9.81])))

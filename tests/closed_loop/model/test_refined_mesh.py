@@ -118,6 +118,7 @@ def test_a_second_mesh_tells_what_the_elements_get_wrong_of_an_effect():
     assert np.linalg.norm(own - told) < 0.4 * np.linalg.norm(own)
 
 
+@pytest.mark.slow
 def test_a_correction_follows_its_effect_to_first_order():
     """From a ratio of 1.2 to 1.3 it changes by 2.0 um rms; what it says of 1.3 beforehand is wrong by 0.39 of that,
     with contact that is right to 10 um."""
@@ -138,6 +139,7 @@ def test_a_correction_follows_its_effect_to_first_order():
     assert not columns[..., 0].any() and columns[..., 1].any()
 
 
+@pytest.mark.slow
 def test_a_speck_does_not_buy_a_better_mesh():
     """An inclusion that changes nothing has elements halved about it, under the probe, and claims none of what they
     improve: 1.2 um rms of correction beside the declared model's 29 um."""
@@ -241,6 +243,7 @@ def test_what_elements_drag_more_is_not_told_where_that_takes_minutes_or_most_ha
     assert FrictionOnRefinedMesh(MESHES, 1, lost)(*asked, {("probe_friction", 0): 0.1}) is None
 
 
+@pytest.mark.slow
 def test_where_it_is_known_nothing_is_run_and_beside_an_inclusion_it_is_not_told():
     """The inclusion is told by other meshes, of halved elements: what friction changes is not their difference."""
     _, o, _, anew = pressed_block()

@@ -180,12 +180,13 @@ def soft_column() -> tuple[Setting, Observation]:
     return replace(setting, mesh=block_mesh((0.05, 0.05, 0.07), (4, 4, 5)), markers=places), o
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "k", "step"),
     [
-        pytest.param("stiffness", 0, 0.1, marks=pytest.mark.slow),
+        ("stiffness", 0, 0.1),
         ("gravity_tilt", 0, 0.02),
-        pytest.param("probe_offset", 2, 2e-4, marks=pytest.mark.slow),
+        ("probe_offset", 2, 2e-4),
     ],
 )
 def test_columns_are_those_of_whole_runs_where_only_friction_keeps_a_soft_body_upright(

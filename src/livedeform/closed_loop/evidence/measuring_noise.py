@@ -13,7 +13,7 @@ import numpy as np
 from scipy.optimize import nnls
 from scipy.special import stdtrit
 
-from livedeform.closed_loop.evidence.shared_motion import Unshared, unshared
+from livedeform.closed_loop.evidence.shared_motion import Unshared, lagged, unshared
 from livedeform.closed_loop.evidence.track import Track
 from livedeform.closed_loop.settings import NoiseSettings
 from livedeform.common.types import Array
@@ -23,6 +23,7 @@ MEDIAN_OVER_MEAN = np.pi / 2.0  # variance of a median of normal numbers over th
 MEDIAN_CHI2_3 = 2.366  # the median of chi-square with three degrees of freedom
 SIGMA_PER_MAD, MAD_PER_SIGMA = 1.4826, 0.6745  # of a normal distribution; MAD: median of absolute deviations
 TINY, TINY_VARIANCE = 1e-12, 1e-16  # m, m2: keep a covariance of identical frames invertible
+SINGLE = 4.0 * float(np.finfo(np.float32).eps)  # of the largest eigenvalue: rounding of what a message states
 LEVEL = 0.975  # of a two-sided 95 % interval
 
 Source = Literal["unshared motion", "quiet stretches", "stated", "second differences", "assumed"]
@@ -82,25 +83,23 @@ def noise_of(data: Track, settings: NoiseSettings) -> NoiseReport:
     One factor, not below one, scales the stated covariances: a tracker knows its anisotropy better than a recording
     does, and what repeats do not show, a systematic part, may be stated with reason.
     """
-    d, seen = _second_differences(data, settings.least_frames)
-    stated, has_stated = _stated(data, settings)
+    lag = _changing_lag(data, settings)
+    d, seen = _second_differences(data, lag, settings.least_frames)
+    quiet = _quiet_differences(data, seen, lag, settings)
     measured = _from_unshared(data, settings)
+    covariance, source = _without_statement(measured, d, quiet, settings)
+    stated, has_stated = _stated(data, settings)
     scale = ratio = float("nan")
     if has_stated:
-        frame_cov = np.where(np.isfinite(data.covariances), data.covariances, stated)
-        quiet = _quiet_differences(data, seen, settings)
-        scale = _scale(d, frame_cov[1:-1], quiet) if quiet.sum() >= settings.enough else 1.0
+        stated = _in_all_directions(stated, covariance)
+        scale = _scale(d, data, stated, quiet, lag, covariance) if quiet.sum() >= settings.enough else 1.0
         if measured is not None:
             ratio = float(measured.value**2 / _size(stated, data) ** 2)
         covariance, source = stated * max(ratio if measured else 1.0, 1.0), "stated"
-    elif measured is not None:
-        covariance, source = _covariance_of(measured, data.points.shape[1], settings), measured.source
-    else:
-        covariance, source = _without_any(d, _quiet_differences(data, seen, settings), settings)
     time, inflation = _correlation(data, measured, settings)
     rest = (scale, time, inflation, int(seen.sum()))
     if measured is None:
-        return NoiseReport(covariance, *rest, source, _size(covariance, data))  # type: ignore[arg-type]
+        return NoiseReport(covariance, *rest, source, _size(covariance, data))
     size = measured.value, measured.interval, len(measured.samples), ratio
     return NoiseReport(covariance, *rest, measured.source, *size)
 
@@ -153,13 +152,25 @@ def zeros(d: Array) -> Array:
     return np.where(np.isfinite(d), d, 0.0)
 
 
-def _second_differences(data: Track, least: int) -> tuple[Array, np.ndarray]:
-    """Second differences in time (f - 2, m, 3) and where there are any (f - 2, m): for white noise of variance s2 they
-    have variance 6 s2, and smooth motion hardly enters (von Neumann et al. 1941)."""
+def _changing_lag(data: Track, settings: NoiseSettings) -> int:
+    """Find after how many frames nearly all points are other ones: a tracker may send each point several times, and
+    what it repeats tells nothing of its noise. 1 where no window is long enough for that."""
+    y, step = data.points, np.diff(data.stamps_ns)
+    most = int(1e9 * settings.window / np.median(step)) if len(step) else 1
+    for lag in range(1, min(most, len(y) // settings.least_frames) + 1):
+        d = (y[lag:] - y[:-lag])[np.isfinite(y[lag:] - y[:-lag]).all(axis=2)]
+        if len(d) and (d != 0.0).any(axis=1).mean() > 0.9:
+            return lag
+    return 1
+
+
+def _second_differences(data: Track, lag: int, least: int) -> tuple[Array, np.ndarray]:
+    """Second differences over ``lag`` frames (f - 2 lag, m, 3) and where there are any (f - 2 lag, m): for white noise
+    of variance s2 they have variance 6 s2, and smooth motion hardly enters (von Neumann et al. 1941)."""
     y = data.points
     if len(y) < least:
         return np.zeros((0, y.shape[1], 3)), np.zeros((0, y.shape[1]), bool)
-    d = y[:-2] - 2.0 * y[1:-1] + y[2:]
+    d = y[: -2 * lag] - 2.0 * y[lag:-lag] + y[2 * lag :]
     return d, np.asarray(np.isfinite(d).all(axis=2))
 
 
@@ -181,10 +192,29 @@ def _size(covariance: Array, data: Track) -> float:
     return float(np.sqrt(np.trace(covariance[ever] if ever.any() else covariance, axis1=1, axis2=2).mean()))
 
 
-def _scale(d: Array, frame_cov: Array, quiet: np.ndarray) -> float:
-    """Variance of second differences over the stated one; the median keeps jerks and outliers out."""
-    z2 = np.einsum("fmi,fmij,fmj->fm", zeros(d), np.linalg.inv(frame_cov), zeros(d))[quiet] / DIFFERENCES
+def _scale(d: Array, data: Track, stated: Array, quiet: np.ndarray, lag: int, own: Array) -> float:
+    """Find the variance of ``quiet`` second differences ``d`` over ``lag`` frames over the one that is stated of each
+    frame, or else (m, 3, 3) of its marker; the median keeps jerks and outliers out."""
+    of_frame, marker = data.covariances[lag:-lag][quiet], np.nonzero(quiet)[1]
+    known = np.isfinite(of_frame).all(axis=(1, 2))[:, None, None]
+    covariance = _in_all_directions(np.where(known, of_frame, stated[marker]), own[marker])
+    z2 = np.einsum("ni,nij,nj->n", d[quiet], np.linalg.inv(covariance), d[quiet]) / DIFFERENCES
     return float(np.median(z2) / MEDIAN_CHI2_3)
+
+
+def _in_all_directions(stated: Array, own: Array) -> Array:
+    """Return covariances (n, 3, 3) m2 as they are ``stated``, along a direction that is stated without any error (to
+    single precision) with what the recording's ``own`` one has there: nothing is measured exactly."""
+    values, vectors = np.linalg.eigh(stated)
+    exact = values < SINGLE * values[:, -1:]
+    rows = exact.any(axis=1)
+    if not rows.any():
+        return stated
+    along = np.einsum("nik,nij,njk->nk", vectors[rows], own[rows], vectors[rows])
+    values, vectors = np.where(exact[rows], along, values[rows]), vectors[rows]
+    out = stated.copy()
+    out[rows] = np.einsum("nik,nk,njk->nij", vectors, values, vectors)
+    return out
 
 
 def _from_unshared(data: Track, settings: NoiseSettings) -> Measured | None:
@@ -280,18 +310,18 @@ def _size_in_time(residual: Array, settings: NoiseSettings) -> tuple[float, floa
 
 def _autocovariance(residual: Array, lags: int) -> Array:
     """Covariance (lags + 1,) m2, summed over the axes, of the residual (f, q, 3) with itself so many frames later."""
-    x, w = np.nan_to_num(residual), np.isfinite(residual[..., 0]).astype(float)
-    out = np.zeros(lags + 1)
-    for k in range(lags + 1):
-        n = len(x) - k
-        out[k] = float((x[k:] * x[:n]).sum()) / max(float((w[k:] * w[:n]).sum()), 1.0)
-    return out
+    x, w = np.nan_to_num(residual).reshape(len(residual), -1), np.isfinite(residual[..., 0]).astype(float)
+    return lagged(x, x, lags) / np.maximum(np.rint(lagged(w, w, lags)), 1.0)
 
 
-def _without_any(d: Array, quiet: np.ndarray, settings: NoiseSettings) -> tuple[Array, Source]:
-    """Return what is taken (m, 3, 3) m2 where nothing is stated and noise cannot be told from motion: second
-    differences, which motion makes larger and slow noise smaller, or an assumption."""
+def _without_statement(
+    measured: Measured | None, d: Array, quiet: np.ndarray, settings: NoiseSettings
+) -> tuple[Array, Source]:
+    """Return what is taken (m, 3, 3) m2 where nothing is stated: what was ``measured``, or where noise cannot be told
+    from motion second differences, which motion makes larger and slow noise smaller, or an assumption."""
     m = d.shape[1]
+    if measured is not None:
+        return _covariance_of(measured, m, settings), measured.source
     if quiet.sum() < settings.few:
         return np.broadcast_to(np.eye(3) * settings.point_sigma**2, (m, 3, 3)).copy(), "assumed"
     covariance = _robust_covariance(d[quiet], settings.sample_outlier) / DIFFERENCES
@@ -311,14 +341,14 @@ def _covariance_of(measured: Measured, m: int, settings: NoiseSettings) -> Array
     return out
 
 
-def _quiet_differences(data: Track, seen: np.ndarray, settings: NoiseSettings) -> np.ndarray:
-    """Second differences (f - 2, m) that motion hardly enters: evenly sampled, and of the quieter two thirds of
-    time."""
+def _quiet_differences(data: Track, seen: np.ndarray, lag: int, settings: NoiseSettings) -> np.ndarray:
+    """Second differences over ``lag`` frames (f - 2 lag, m) that motion hardly enters: evenly sampled, and of the
+    quieter two thirds of time."""
     if len(data.stamps_ns) < settings.least_frames or not seen.any():
         return seen
-    dt = np.diff(data.stamps_ns) * 1e-9
-    even = np.abs(dt[1:] - dt[:-1]) < settings.even * np.median(dt)
-    slope = np.nanmedian(np.abs(data.points[2:] - data.points[:-2]).sum(axis=2), axis=1)
+    dt = (data.stamps_ns[lag:] - data.stamps_ns[:-lag]) * 1e-9
+    even = np.abs(dt[lag:] - dt[:-lag]) < settings.even * np.median(dt)
+    slope = np.nanmedian(np.abs(data.points[2 * lag :] - data.points[: -2 * lag]).sum(axis=2), axis=1)
     with np.errstate(invalid="ignore"):
         slow = slope <= np.nanquantile(slope, settings.quiet)
     rows = even & slow

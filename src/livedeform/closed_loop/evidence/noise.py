@@ -155,11 +155,18 @@ class Whitener:
 
 @dataclass(frozen=True)
 class Steady:
-    """An error of each marker's measuring that lasts: the same at all moments of one ``looks`` (k,), with
-    ``covariances`` (k, m, 3, 3)."""
+    """An error of each marker's measuring that lasts, of a size whose ``roots`` (k, m, 3, 3) m are square roots of its
+    covariances: a share of it that ``varies`` is the same at all moments of one of the marker's ``looks`` (k, m), the
+    rest at all moments."""
 
     looks: np.ndarray
-    covariances: Array
+    roots: Array
+    varies: float = 1.0
+
+    def of(self, marker: int, moment: np.ndarray, axis: np.ndarray) -> Array:
+        """Return its covariance (n, n) m2 between a marker's rows at a ``moment`` (n,) along an ``axis`` (n,) each."""
+        root = self.roots[moment, marker, axis]
+        return np.asarray((1.0 - self.varies + self.varies * _same(self.looks[moment, marker])) * (root @ root.T))
 
 
 def covariance_of(
@@ -191,7 +198,7 @@ def covariance_of(
         else:
             block = _same(moment) * _among(covariances[moment, i], axis)
             if steady is not None:
-                block += _same(steady.looks[moment]) * _among(steady.covariances[moment, i], axis)
+                block += steady.of(int(i), moment, axis)
             block = 0.5 * (block + block.T)
             block += same_axis * (errors.place_sigma[i] ** 2 + errors.absolute**2)
             size = motion[moment, i]

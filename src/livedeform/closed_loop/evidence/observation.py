@@ -314,7 +314,8 @@ def _probe_at(poses: Sequence[Pose], probe: Array | None, cut: Windows) -> tuple
 
 def _with_forces(o: Observation, wrenches: Sequence[Wrench], cut: Windows, settings: Settings) -> Observation:
     """Add the forces at the key moments, their noise, and the recording's course of the force."""
-    forces, sigma = forces_at(wrenches, o.stamps_ns, cut.rows, cut.t, o.start_ns, o.force_sigma, settings.noise)
+    path = PosePath(o.path) if len(o.path) > 1 else None
+    forces, sigma = forces_at(wrenches, o.stamps_ns, cut.rows, cut.t, o.start_ns, o.force_sigma, settings, path)
     if forces is None:
         return replace(o, force_sigma=sigma)
     in_order = sorted(wrenches, key=lambda w: w.stamp_ns)

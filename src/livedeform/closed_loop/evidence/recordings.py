@@ -57,7 +57,7 @@ def read_evidence(
         rest = views[name].rest
         frames, note = marker_frames(acting, recording, rest, settings.sampling, tell)
         named, exchanged = with_own_ids(track(frames, experiment.markers.ids), exchanges_in(frames), rest)
-        notes += [f"{name}: {text}" for text in (*recording.warnings, *note, *exchanged)]
+        notes += [f"{name}: {text}" for text in (*recording.warnings, *note, *_of_copies(named), *exchanged)]
         seen = since_seen(without(named, recording.start_ns, release, sigma, sampling.letting_go))
         observed = observe(
             name,
@@ -77,6 +77,13 @@ def read_evidence(
         parts = [split(o) for o in fitted]
         fitted, held_out = [p[0] for p in parts], [replace(p[1], before=p[0]) for p in parts]
     return Evidence(tuple(fitted), tuple(held_out), tuple(notes))
+
+
+def _of_copies(data: Track) -> list[str]:
+    """Say how many frames a tracker sent again."""
+    if not data.copies:
+        return []
+    return [f"{data.copies} frames repeat the one before to the bit, and are left out: their noise is no new one"]
 
 
 def _of_the_force(o: Observation, n_wrenches: int) -> list[str]:

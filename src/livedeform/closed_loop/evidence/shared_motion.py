@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.fft import irfft, next_fast_len, rfft
 from scipy.linalg import solveh_banded
 
 from livedeform.closed_loop.settings import NoiseSettings
@@ -41,18 +42,34 @@ class Unshared:
         inner = 0.5 * (C.T @ RC)
         half = RC - C @ inner  # M R M = R - C half^T - half C^T
         C, half = among[:, None] * C, among[:, None] * half
-        out = np.zeros(lags + 1)
-        for k in range(lags + 1):
-            n = len(C) - k
-            pairs = among[k:] * among[:n]
-            if not pairs.any():
-                continue
-            lost = np.vdot(C[:n], half[k:]) + np.vdot(half[:n], C[k:])
-            correlation = np.exp((seconds[:n] - seconds[k:]) / tau) if tau > 0.0 else float(k == 0)
-            out[k] = float((pairs * correlation).sum() - lost) / pairs.sum()
+        lost = lagged(C, half, lags) + lagged(half, C, lags)
+        pairs = np.rint(lagged(among, among, lags))
+        out = np.divide(_fading(seconds, tau, lags, among) - lost, pairs, out=np.zeros(lags + 1), where=pairs > 0.0)
         # one direction in space goes with each course that the data themselves chose
         kept: float = max(1.0 - (C.shape[1] - 1) / (3.0 * len(self.markers)), 0.0)
         return out * kept
+
+
+def lagged(a: Array, b: Array, lags: int) -> Array:
+    """Sum (lags + 1,) the products of ``a`` (f, ...) and ``b`` (f, ...) so many frames later, over frames and columns;
+    by Fourier transforms, as a loop would grow with the square of a tracker's rate."""
+    n = next_fast_len(len(a) + lags, real=True)
+    spectra = [rfft(x.reshape(len(x), -1), n=n, axis=0) for x in (a, b)]
+    return np.asarray(irfft((spectra[0].conj() * spectra[1]).sum(axis=1), n=n)[: lags + 1])
+
+
+def _fading(seconds: Array, tau: float, lags: int, among: Array) -> Array:
+    """Sum (lags + 1,) correlations that fade by exp(-dt / tau) over pairs of frames so many frames apart, of those that
+    are ``among`` (f,) what counts."""
+    out, part = np.zeros(lags + 1), among.copy()
+    step = np.exp(-np.diff(seconds) / tau) if tau > 0.0 else np.zeros(len(seconds) - 1)
+    for k in range(lags + 1):
+        n = len(among) - k
+        out[k] = part[:n] @ among[k:]
+        part = part[: n - 1] * step[k:]
+        if not part.max(initial=0.0) > TINY:
+            break
+    return out
 
 
 def _faded(courses: Array, step: Array) -> Array:

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from livedeform.common.checks.recorded import POSES_APART_NS
 from livedeform.common.errors import RecordingError
 from livedeform.common.types import Array, MarkerFrame
 
@@ -14,12 +15,14 @@ from livedeform.common.types import Array, MarkerFrame
 @dataclass(frozen=True)
 class Track:
     """All frames of one recording on one set of markers: ``points`` (f, m, 3) with NaN where a marker was not seen,
-    ``covariances`` (f, m, 3, 3) as stated by the tracker (NaN where it states none)."""
+    ``covariances`` (f, m, 3, 3) as stated by the tracker (NaN where it states none). So many frames were ``copies`` of
+    others, and are left out."""
 
     stamps_ns: np.ndarray
     ids: np.ndarray
     points: Array
     covariances: Array
+    copies: int = 0
 
     def take(self, keep: np.ndarray) -> Track:
         """Some of the frames (f,) bool."""
@@ -39,7 +42,8 @@ class Track:
 
 
 def track(frames: Sequence[MarkerFrame], ids: np.ndarray | None = None) -> Track:
-    """The frames on one set of markers, in the order of their stamps; markers that are not in ``ids`` are left out."""
+    """Put the frames on one set of markers, in the order of their stamps; markers that are not in ``ids`` are left out,
+    and so are frames that a tracker sent again (`copies_in`)."""
     if not frames:
         raise RecordingError(
             "the recording has no marker frames", remedy="run stereo_node on it first, or check the topic"
@@ -60,4 +64,25 @@ def track(frames: Sequence[MarkerFrame], ids: np.ndarray | None = None) -> Track
         known = ids[place] == frame.ids
         points[k, place[known]] = frame.points[known]
         covariances[k, place[known]] = frame.covariances[known]
-    return Track(stamps[keep], ids, points, covariances)
+    covariances[~(np.trace(covariances, axis1=2, axis2=3) > 0.0)] = np.nan  # zero states nothing, as in a recording
+    stamps = stamps[keep]
+    again = copies_in(points, stamps)
+    return replace(Track(stamps, ids, points, covariances).take(~again), copies=int(again.sum()))
+
+
+def copies_in(points: Array, stamps_ns: np.ndarray) -> np.ndarray:
+    """Tell which frames (f,) of ``points`` (f, m, 3) a tracker sent again, as one that publishes more often than it
+    measures: all that is seen in a frame and the one before is the same to the bit, and that is usual.
+
+    A body at rest, measured without noise, stays the same for longer than frames may be apart: these are no copies.
+    """
+    both = np.asarray(np.isfinite(points[1:] - points[:-1]).all(axis=2))
+    moved = (both[..., None] & (points[1:] != points[:-1])).any(axis=(1, 2))
+    begins = np.r_[True, moved | ~both.any(axis=1)][: len(points)]
+    starts = np.flatnonzero(begins)
+    usual = np.median(np.diff(np.r_[starts, len(points)]))
+    longest = POSES_APART_NS / np.median(np.diff(stamps_ns)) if len(stamps_ns) > 1 else 1.0
+    if not 2.0 <= usual <= longest:
+        return np.zeros(len(points), bool)
+    place = np.arange(len(points)) - starts[np.cumsum(begins) - 1]
+    return np.asarray(place % int(longest) != 0)

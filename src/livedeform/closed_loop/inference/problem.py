@@ -11,7 +11,6 @@ from livedeform.closed_loop.evidence.noise import (
     Covariance,
     Nuisance,
     Rows,
-    Steady,
     covariance_of,
     join,
     registration_columns,
@@ -25,6 +24,7 @@ from livedeform.closed_loop.forward import Column, Correction, Run
 from livedeform.closed_loop.inference.fitted_model import FittedModel, Uncertain
 from livedeform.closed_loop.inference.forms import swing_rate
 from livedeform.closed_loop.inference.gauss_newton import Problem
+from livedeform.closed_loop.inference.steady import steady_of
 from livedeform.closed_loop.settings import AllowanceSettings
 from livedeform.common.errors import ConvergenceError
 from livedeform.common.types import Array
@@ -65,7 +65,7 @@ class ProblemFactory:
         d_forces = np.nan_to_num(run.d_forces) if run.d_forces is not None else None
         residual = rows.take(np.nan_to_num(y) - f, force_residual)
         columns = rows.take(np.nan_to_num(run.d_points), d_forces if forces is not None else None)
-        covariance, nuisance = self._noise(model, rows, f, predicted_forces)
+        covariance, nuisance = self._noise(model, rows, y, f, predicted_forces)
         if model.allowed:
             extra = columns[:, len(dictionary) :]
             nuisance = join([nuisance, self._allowed(model, rows, extra, motion_of(f, observations))])
@@ -114,8 +114,10 @@ class ProblemFactory:
             forces = None
         return y, f, forces, np.nan_to_num(run.forces) if run.forces is not None else None
 
-    def _noise(self, model: FittedModel, rows: Rows, f: Array, forces: Array | None) -> tuple[Covariance, Nuisance]:
-        """Form C and Z at predicted points ``f`` (k, m, 3)."""
+    def _noise(
+        self, model: FittedModel, rows: Rows, y: Array, f: Array, forces: Array | None
+    ) -> tuple[Covariance, Nuisance]:
+        """Form C and Z at measured points ``y`` and predicted points ``f`` (k, m, 3)."""
         observations, uncertain, settings = self.observations, model.uncertain, self.settings
         blocks, recording = self.presses, recordings_of(observations)
         motion = motion_of(f, observations)
@@ -131,7 +133,7 @@ class ProblemFactory:
             e,
             force=forces,
             force_sigma=sigma_force,
-            steady=steady_of(observations, f, settings.look),
+            steady=steady_of(observations, f, y - f, e, motion, blocks_of(observations), settings.look),
             settings=settings,
         )
         places = np.nanmean(f, axis=0)
@@ -218,22 +220,6 @@ def blocks_of(observations: Sequence[Observation]) -> np.ndarray:
 def recordings_of(observations: Sequence[Observation]) -> np.ndarray:
     """Number of the recording (k,) that each moment belongs to."""
     return np.concatenate([np.full(o.n_moments, i) for i, o in enumerate(observations)])
-
-
-def steady_of(observations: Sequence[Observation], points: Array, look: float) -> Steady:
-    """Return what the tracker states and repeats do not show: it lasts while the markers, predicted at ``points`` (k,
-    m, 3), are looked at in the same way, and is another one where they have moved by ``look`` m rms."""
-    blocks = blocks_of(observations)
-    looks = np.full(len(blocks), -1)
-    for k in range(len(blocks)):
-        if looks[k] < 0:
-            moved = np.sqrt(np.mean((points - points[k]) ** 2, axis=(1, 2)))
-            looks[(blocks == blocks[k]) & (moved < look) & (looks < 0)] = k
-    missing = [
-        np.broadcast_to((1.0 - o.noise.repeated) * o.noise.covariance, (o.n_moments, *o.noise.covariance.shape))
-        for o in observations
-    ]
-    return Steady(looks, np.concatenate(missing))
 
 
 def shallowness(motion: Array, blocks: np.ndarray) -> Array:

@@ -118,7 +118,8 @@ def read_covariances(rows: NDArray[Any]) -> Array:
 
 
 def wrong_covariances(covariances: Array) -> NDArray[np.bool_]:
-    """Return which (n,) are stated and yet no covariances: infinite, in part NaN, or with a negative eigenvalue."""
+    """Return which (n,) are stated and yet no covariances: infinite, in part NaN, with a negative eigenvalue, or zero,
+    by which ROS says that it is unknown."""
     unstated = np.isnan(covariances).all(axis=(1, 2))
     finite = np.isfinite(covariances).all(axis=(1, 2))
     wrong: NDArray[np.bool_] = np.asarray(~unstated & ~finite)
@@ -127,7 +128,7 @@ def wrong_covariances(covariances: Array) -> NDArray[np.bool_]:
     scaled = covariances[rows] / np.where(largest > 0, largest, 1.0)  # of any size: eigenvalues do not overflow
     doubtful = ~_surely_positive(scaled)
     lowest, highest = np.linalg.eigvalsh(scaled[doubtful])[:, [0, 2]].T
-    wrong[rows[doubtful]] = (lowest < -1e-4 * np.abs(highest)) | (highest < 0.0)  # single precision rounds
+    wrong[rows[doubtful]] = (lowest < -1e-4 * np.abs(highest)) | (highest <= 0.0)  # single precision rounds
     return wrong
 
 

@@ -116,6 +116,11 @@ class BagReader:
     def n_messages(self) -> int:
         return sum(info.count for info in self.topics.values())
 
+    @property
+    def seeks(self) -> bool:
+        """Tell whether messages are read from some time on without all that were before."""
+        return all(part.seeks for part in self._parts)
+
     def messages(
         self, topics: Iterable[str] | None = None, start_ns: int | None = None, stop_ns: int | None = None
     ) -> Iterator[RawMessage]:

@@ -11,7 +11,7 @@ import struct
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields
-from itertools import islice
+from itertools import islice, pairwise
 from pathlib import Path
 from typing import Any
 
@@ -35,7 +35,7 @@ NS = 1_000_000_000
 BEGINS = "begins_ns"  # in the metadata of a run: when the recording began that was run
 PICTURES = (*t.IMAGES, *t.COMPRESSED_IMAGES)
 MEASURED_TOPICS = (t.STEREO_MARKERS, t.STEREO_SURFACE, t.PROBE_POSE, t.PROBE_WRENCH, *PICTURES)
-FEW = 3  # pictures at the beginning, by whose arrival a clock is told
+FEW = 40  # pictures of each camera, spread over the recording, by whose arrival a clock is told
 SAME_PLACE, SAME_TURN = 1e-4, 1e-3  # m and rad: transforms further apart than that are two
 Stamps = list[tuple[int, int]]  # of one topic: header.stamp and receive time of each message, ns
 HEADED_TYPES = frozenset(
@@ -74,10 +74,11 @@ class Recording:
     ``uncorrected_marker_frames`` are a run's markers before a measuring effect was corrected (empty if none was).
     ``warnings`` has one line per thing that was left out or looks odd, ``faults`` counts the same by name
     (`common.checks.recorded.FAULTS`). ``unknown_ids`` are of markers that the experiment does not have;
-    ``picture_stamps_ns`` of the first and last left pictures. ``repeats`` counts by topic the messages whose stamp was
+    ``picture_stamps_ns`` of these left pictures. ``repeats`` counts by topic the messages whose stamp was
     there already: how many were ``left_out``, and how many ``joined``; ``other_frames`` by topic the frame that it
     says, where that is not the phantom's; ``arrivals`` by topic of what was measured good stamps and when
-    these messages came (of pictures the first few and those of the last second).
+    these messages came (of each camera's pictures a few, spread evenly, and those of the last second).
+    ``force_doubts`` say why its forces may be wrong, where that was looked at (`load_checked`).
     """
 
     path: Path
@@ -100,6 +101,7 @@ class Recording:
     repeats: Mapping[str, Repeats] = field(default_factory=dict)
     other_frames: Mapping[str, str] = field(default_factory=dict)
     arrivals: Mapping[str, Stamps] = field(default_factory=dict)
+    force_doubts: list[str] = field(default_factory=list)
 
     @property
     def own_name(self) -> str:
@@ -143,11 +145,12 @@ def load_recording(path: Path | str, experiment: Experiment | None = None) -> Re
         for raw in bag.messages([name for name in t.LOADED if name in bag.topics]):
             collector.take(raw)
         collector.finish()
-        start_ns, end_ns = stamp_range(bag, collector.stamps)
+        stamps = collector.stamps | stamps_besides(bag)
+        start_ns, end_ns = stamp_range(bag, stamps)
         metadata = dict(bag.metadata)
         collector.given = not any(name in bag.topics for name in PICTURES)
-        arrivals = arrivals_of(bag, collector.stamps)
-        pictures = next((tuple(stamp for stamp, _ in arrivals[name]) for name in PICTURES if name in arrivals), ())
+        arrivals = arrivals_of(bag, stamps)
+        pictures = tuple(stamp for stamp, _ in arrivals.get(picture_topic(bag, t.LEFT_IMAGE) or "", ()))
     known = None if experiment is None else experiment.markers.ids
     marker_frames = [_keep(f, known, collector) for f in collector.sorted(t.STEREO_MARKERS)]
     uncorrected = [_keep(f, known, collector) for f in collector.sorted(t.STEREO_MARKERS_RAW)]
@@ -234,21 +237,49 @@ def good_messages(known: Stamps) -> Stamps:
 
 
 def arrivals_of(bag: BagReader, known: Mapping[str, Stamps]) -> dict[str, Stamps]:
-    """Return by topic the good stamps of what was measured, and when these messages came. Markers that are found in
-    pictures came as late as that took, and tell nothing of a clock; pictures are read at both ends, of the left camera.
-    """
-    left, filmed = picture_topic(bag, t.LEFT_IMAGE), any(name in bag.topics for name in PICTURES)
-    pairs = {} if left is None else {left: header_stamps(ends(bag, left, FEW))}
-    pairs |= {name: known[name] for name in (t.PROBE_POSE, *(() if filmed else (t.STEREO_MARKERS,)))}
-    return {name: each for name, all_of_it in pairs.items() if (each := good_messages(all_of_it))}
+    """Return by topic the good stamps of what was measured, of those that are ``known``, and when these messages came.
+    Markers and surfaces that are found in pictures came as late as that took, and tell nothing of a clock."""
+    filmed = any(name in bag.topics for name in PICTURES)
+    names = [name for name in (*PICTURES, *clocked(filmed)) if name in known]
+    return {name: each for name in names if (each := good_messages(known[name]))}
 
 
-def ends(bag: BagReader, topic: str, first: int = 1) -> Iterator[RawMessage]:
-    """Return the messages of a topic; of pictures, which are large, just the ``first`` and those of the last second."""
+def clocked(filmed: bool) -> tuple[str, ...]:
+    """Return the topics, beside pictures, whose messages come as soon as they are stamped: markers and surfaces, unless
+    they are found in what was ``filmed``."""
+    robot = (t.PROBE_POSE, t.PROBE_WRENCH)
+    return robot if filmed else (*robot, t.STEREO_MARKERS, t.STEREO_SURFACE)
+
+
+def stamps_besides(bag: BagReader) -> dict[str, Stamps]:
+    """Return by topic the stamps of what was measured and is not loaded: of surfaces, and of some of the pictures of
+    each camera (`spread`)."""
+    surfaces = {t.STEREO_SURFACE} & bag.topics.keys()
+    cameras = {name for topic in t.IMAGES if (name := picture_topic(bag, topic)) is not None}
+    return {name: header_stamps(bag.messages([name])) for name in surfaces} | {
+        name: header_stamps(spread(bag, name)) for name in cameras
+    }
+
+
+def spread(bag: BagReader, topic: str) -> Iterator[RawMessage]:
+    """Return some messages of a topic: the first, `FEW` that are spread evenly over the bag, and those of the last
+    second; all where the file cannot be read but from its beginning on."""
+    if not bag.seeks:
+        yield from bag.messages([topic])
+        return
+    last = max(bag.end_ns - NS, bag.start_ns)
+    begins = [bag.start_ns + (last - bag.start_ns) * k // FEW for k in range(FEW)]
+    for begin, end in pairwise([*begins, last]):
+        yield from islice(bag.messages([topic], begin, end), 1)
+    yield from bag.messages([topic], start_ns=last)
+
+
+def ends(bag: BagReader, topic: str) -> Iterator[RawMessage]:
+    """Return the messages of a topic; of pictures, which are large, just the first and those of the last second."""
     if topic not in PICTURES:
         yield from bag.messages([topic])
         return
-    yield from islice(bag.messages([topic]), first)
+    yield from islice(bag.messages([topic]), 1)
     yield from bag.messages([topic], start_ns=bag.end_ns - NS)
 
 
@@ -443,7 +474,9 @@ class _Collector:
         if n and topic in _PHANTOM_TOPICS and frame_id not in (t.FRAME_PHANTOM, ""):
             self.other_frames.setdefault(topic, frame_id)
         if n_wrong:
-            self.count(f"{topic}: covariances that are negative, infinite or incomplete are taken as unknown", n_wrong)
+            self.count(
+                f"{topic}: covariances that are zero, negative, infinite or incomplete are taken as unknown", n_wrong
+            )
             self.faults["covariance"] += n_wrong
 
     def _transforms(self, message: Any) -> None:
@@ -516,31 +549,49 @@ def _is_same(one: Pose, other: Pose) -> bool:
     return bool(np.linalg.norm(one.position - other.position) < SAME_PLACE and turn < SAME_TURN)
 
 
-def _keep(frame: MarkerFrame, known: Ids | None, collector: _Collector) -> MarkerFrame:
-    """Return the frame without markers that are not finite, not known, or there twice."""
-    keep = np.asarray(np.isfinite(frame.points).all(axis=1))
-    key = frame.ids.tobytes()
-    if key in collector.sound_ids and keep.all():
-        return frame
-    if not keep.all():
-        collector.faults["not_finite"] += int((~keep).sum())
-        collector.count(f"{t.STEREO_MARKERS}: markers left out in some frames, their coordinates are not finite")
-    if known is not None:
-        unknown = keep & ~np.isin(frame.ids, known)
-        if unknown.any():
-            collector.unknown |= set(frame.ids[unknown].tolist())
-            collector.count(
-                f"{t.STEREO_MARKERS}: markers left out in some frames, the experiment does not know their ids"
-            )
-        keep &= ~unknown
-    twice = layouts.named_twice(frame.ids, keep)
-    if twice.any():
-        collector.faults["twice"] += len(np.unique(frame.ids[twice]))
-        collector.count(f"{t.STEREO_MARKERS}: markers left out in some frames, their id is there twice")
-    keep &= ~twice
+@dataclass(frozen=True)
+class SoundFrame:
+    """A measured ``frame`` without what nobody can use: so many markers were ``not_finite``, the ids of the ``unknown``
+    are none of the experiment's, and so many ids were there ``twice``."""
+
+    frame: MarkerFrame
+    not_finite: int = 0
+    unknown: frozenset[int] = frozenset()
+    twice: int = 0
+
+
+def sound_frame(frame: MarkerFrame, known: Ids | None) -> SoundFrame:
+    """Leave out the markers of a frame that are not finite, none of the ``known`` (all are where None), or there twice:
+    what is recorded and what comes in live is looked at alike."""
+    finite = np.asarray(np.isfinite(frame.points).all(axis=1))
+    unknown = np.zeros(len(finite), bool) if known is None else finite & ~np.isin(frame.ids, known)
+    twice = layouts.named_twice(frame.ids, finite & ~unknown)
+    keep = finite & ~unknown & ~twice
     if keep.all():
-        collector.sound_ids.add(key)
-        return frame
-    return MarkerFrame(
+        return SoundFrame(frame)
+    kept = MarkerFrame(
         frame.stamp_ns, frame.ids[keep], frame.points[keep], frame.covariances[keep], frame.reprojection_error_px[keep]
     )
+    ids = frozenset(frame.ids[unknown].tolist())
+    return SoundFrame(kept, int((~finite).sum()), ids, len(np.unique(frame.ids[twice])))
+
+
+def _keep(frame: MarkerFrame, known: Ids | None, collector: _Collector) -> MarkerFrame:
+    """Return the frame without markers that are not finite, not known, or there twice, which are counted."""
+    key = frame.ids.tobytes()
+    if key in collector.sound_ids and np.isfinite(frame.points).all():
+        return frame
+    found = sound_frame(frame, known)
+    if found.frame is frame:
+        collector.sound_ids.add(key)
+        return frame
+    why = {
+        "their coordinates are not finite": found.not_finite,
+        "the experiment does not know their ids": len(found.unknown),
+        "their id is there twice": found.twice,
+    }
+    for reason in (reason for reason, n in why.items() if n):
+        collector.count(f"{t.STEREO_MARKERS}: markers left out in some frames, {reason}")
+    collector.faults.update({name: n for name, n in (("not_finite", found.not_finite), ("twice", found.twice)) if n})
+    collector.unknown |= found.unknown
+    return found.frame

@@ -108,6 +108,11 @@ class McapFile:
         info = TopicInfo(channel.topic, schema.name if schema else "", 0, definition, _why_undecodable(schema, channel))
         self.topics[channel.topic] = replace(have or info, count=(have.count if have else 0) + count)
 
+    @property
+    def seeks(self) -> bool:
+        """Tell whether an index leads to the messages of some time."""
+        return self._index is not None and bool(self._index.chunks)
+
     def messages(self, topics: list[str], start_ns: int | None, stop_ns: int | None) -> Iterator[RawMessage]:
         """Yield the messages in the order of their receive times; of one time in the order of the file."""
         if self._index is not None and self._index.chunks:
@@ -190,6 +195,7 @@ class Rosbag2Storage:
     """A bag in a storage that rosbags reads: sqlite3, or compressed by message or by file."""
 
     n_beyond = 0  # sqlite's times are signed, as ours
+    seeks = True
 
     def __init__(self, path: Path) -> None:
         self.path = path

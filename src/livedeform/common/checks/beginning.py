@@ -10,94 +10,126 @@ import numpy as np
 from livedeform.common.bags.recording import Recording
 from livedeform.common.checks.finding import Finding
 from livedeform.common.checks.presses import count_presses, lasting, motion, without_noise
-from livedeform.common.checks.probe_path import TOUCH, ProbeApproach, probe_path, sag_bound
-from livedeform.common.checks.tared import clear_limit, depths_of, in_the_air
-from livedeform.common.experiment.schema import Experiment
-from livedeform.common.experiment.surface import Surface
+from livedeform.common.checks.probe_path import CLEAR, TOUCH, ProbeApproach, ProbeRecord
+from livedeform.common.checks.tared import LARGEST, depths_of, in_the_air
 from livedeform.common.types import Array
 
-HALF, SOME = 0.5, 0.2  # of the way from the shallowest to the deepest: beyond that a probe presses, or may do so
+HALF, SOME = 0.5, 0.2  # of the way from where the body may begin to the deepest: beyond, a probe presses, or may do so
 PRESSED, SIGMAS = 0.1, 5.0  # a force: share of the largest one, and of what it scatters by in the air
 AROUND = 0.25  # s about the beginning, whose median force counts
+IN_THE_AIR = "begin with the probe in the air"
 
 
-def check_beginning(recording: Recording, experiment: Experiment, body: Surface) -> list[Finding]:
-    """Check whether a recording begins within a press, of a body that may sag by more than the probe is deep."""
-    if experiment.probe is None or not recording.poses:
+def check_beginning(probe: ProbeRecord) -> list[Finding]:
+    """Check whether a recording begins with the probe inside the body, or, where that may sag by more than the probe is
+    deep, within a press."""
+    path = probe.path
+    if path is None:
         return []
-    path = probe_path(recording.poses, experiment.probe.shape, body, recording.start_ns)
-    limit = clear_limit(recording, experiment, body)
-    surely = _surely_inside(path, experiment, body)
-    if surely or not (_as_deep_as_later(path) or _force_shows(recording, path, float(path.seconds[0]), limit)):
+    if _surely_inside(probe, path, float(path.seconds[0])):
+        text = f"the recording begins with the probe {1e3 * path.depths[0]:.1f} mm inside the body"
+        return [Finding("WARN", text, "begin the recording with the probe in the air", doubts=True)]
+    shown = _force_shows(probe, path, float(path.seconds[0]))
+    if not shown and (shown is False or not _as_deep_as_later(probe, path) or _markers_stayed(probe, path)):
         return []
-    return [_within_a_press(float(path.seconds[0]))]
+    text = f"it begins within a press (at {path.seconds[0]:.3g} s): the body is taken to rest there"
+    return [Finding("WARN", text, IN_THE_AIR, doubts=True)]
 
 
-def begins_inside(recording: Recording, experiment: Experiment, body: Surface) -> bool:
-    """Tell whether the probe begins in the body, however that may sag: `check_probe` says so."""
-    if experiment.probe is None or not recording.poses:
-        return False
-    path = probe_path(recording.poses, experiment.probe.shape, body, recording.start_ns)
-    return _surely_inside(path, experiment, body)
-
-
-def _surely_inside(path: ProbeApproach, experiment: Experiment, body: Surface) -> bool:
-    return float(path.depths[0]) > TOUCH + sag_bound(experiment, body)
-
-
-def check_start(
-    whole: Recording,
-    experiment: Experiment,
-    body: Surface,
-    start: float,
-    remembers: Sequence[str],
-    rubs: Sequence[str],
-    *,
-    said: bool = False,
-) -> list[Finding]:
-    """Check what is left out of a ``whole`` recording that is run from ``start`` s on: a press that is under way, and
-    presses before it, where the model ``remembers`` these for the reasons given, or, while the probe touches, since it
-    ``rubs``. That it begins inside the body may be ``said`` already."""
-    if experiment.probe is None or not whole.poses or start <= 0.0:
+def check_start(probe: ProbeRecord, start: float, *, registers: bool) -> list[Finding]:
+    """Check whether a recording is run from within a press on, ``start`` s after it began, to which the model comes
+    from the recording's beginning: cameras that are registered there (``registers``) are so to a body at rest."""
+    if probe.path is None or not _is_pressed(probe, probe.path, start):
         return []
-    path = probe_path(whole.poses, experiment.probe.shape, body, whole.start_ns)
-    limit = clear_limit(whole, experiment, body)
-    presses = _presses(whole, path, limit)
+    text = f"it begins within a press (at {start:.3g} s)"
+    if registers:
+        text += ": the cameras are registered to a body that is taken to rest there"
+        return [Finding("WARN", text, IN_THE_AIR, doubts=True)]
+    return [Finding("NOTE", text + ", from where on presses are counted by how the markers move")]
+
+
+def check_left_out(probe: ProbeRecord, start: float, remembers: Sequence[str], rubs: Sequence[str]) -> list[Finding]:
+    """Check what a model lacks that was not led through what came before ``start`` s: a press that is under way, and
+    presses that it ``remembers``, for the reasons given, or, while the probe touches, since it ``rubs``."""
+    path = probe.path
+    if path is None or start <= 0.0:
+        return []
     found = []
-    within = any(a <= start <= b for a, b in presses) or _is_deep(path, start)
-    if within or _force_shows(whole, path, start, limit):
+    if _is_pressed(probe, path, start):
         remembers = [*remembers, *rubs]
-        found += [] if said else [_within_a_press(start)]
-    if remembers and (_went_in_before(path, start) or any(a < start for a, _ in presses)):
+        text = f"it begins within a press (at {start:.3g} s): the body is taken to rest there"
+        found.append(Finding("WARN", text, IN_THE_AIR, doubts=True))
+    presses = _presses(probe.recording, path, probe.clear_limit)
+    if remembers and (_went_in_before(probe, path, start) or any(a < start for a, _ in presses)):
         text = f"--start {start:.3g} s leaves out presses that the model would remember ({', '.join(remembers)})"
         found.append(Finding("WARN", text, "run the recording from its beginning", doubts=True))
     return found
 
 
-def _within_a_press(at: float) -> Finding:
-    text = f"it begins within a press (at {at:.3g} s): the body is taken to rest there"
-    return Finding("WARN", text, "begin with the probe in the air", doubts=True)
+def last_clear(probe: ProbeRecord, at: float) -> float:
+    """Return when (s) the probe was last clear of the body, ``at`` s at most, as far as the poses that are looked at
+    tell; where it never was until then, when its poses begin."""
+    path = probe.path
+    if path is None:
+        return at
+    clear = (path.seconds <= at) & (path.depths < probe.clear_limit)
+    return float(path.seconds[clear].max(initial=path.seconds[0]))
 
 
-def _is_deep(path: ProbeApproach, at: float) -> bool:
+def _is_pressed(probe: ProbeRecord, path: ProbeApproach, at: float) -> bool:
+    """Tell by the poses, the markers or the forces whether the body is pressed at ``at`` s."""
+    presses = _presses(probe.recording, path, probe.clear_limit)
+    if any(a <= at <= b for a, b in presses) or _surely_inside(probe, path, at):
+        return True
+    shown = _force_shows(probe, path, at)
+    return _is_deep(probe, path, at) and not _markers_stayed(probe, path) if shown is None else shown
+
+
+def _surely_inside(probe: ProbeRecord, path: ProbeApproach, at: float) -> bool:
+    """Tell whether the probe is in the body at ``at`` s, however that may sag."""
+    return float(np.interp(at, path.seconds, path.depths)) > TOUCH + probe.sag
+
+
+def _outermost(probe: ProbeRecord, path: ProbeApproach) -> float:
+    """Return the depth (m) from which the probe's way into the body counts: where its surface may be at the highest, or
+    the shallowest pose where the probe never leaves. However far it is drawn back in the air tells nothing."""
+    return max(float(path.depths.min()), probe.clear_limit + CLEAR)
+
+
+def _is_deep(probe: ProbeRecord, path: ProbeApproach, at: float) -> bool:
     """Tell whether the probe is in the body as given at ``at`` s, by more than half of the way that it goes."""
-    depth, low = float(np.interp(at, path.seconds, path.depths)), float(path.depths.min())
-    return depth > TOUCH and depth - low > HALF * (float(path.depths.max()) - low)
+    depth, outer = float(np.interp(at, path.seconds, path.depths)), _outermost(probe, path)
+    return depth > TOUCH and depth - outer > HALF * (float(path.depths.max()) - outer)
 
 
-def _went_in_before(path: ProbeApproach, start: float) -> bool:
-    """Tell whether the probe was in the body as given before ``start`` s, by some of the way that it goes."""
-    low, before = float(path.depths.min()), float(path.depths[path.seconds <= start].max(initial=-np.inf))
-    return before > 0.0 and before - low > SOME * (float(path.depths.max()) - low)
+def _went_in_before(probe: ProbeRecord, path: ProbeApproach, start: float) -> bool:
+    """Tell whether the probe was in the body as given before ``start`` s, by some of the way that it goes, and the
+    force there is not that in the air."""
+    outer, before = _outermost(probe, path), np.where(path.seconds <= start, path.depths, -np.inf)
+    most = int(np.argmax(before))
+    if before[most] <= 0.0 or before[most] - outer <= SOME * (float(path.depths.max()) - outer):
+        return False
+    return _force_shows(probe, path, float(path.seconds[most])) is not False
 
 
-def _as_deep_as_later(path: ProbeApproach) -> bool:
+def _as_deep_as_later(probe: ProbeRecord, path: ProbeApproach) -> bool:
     """Tell whether the probe is in the body at first by as much as in a press that follows once it had left, and that
     is over."""
-    least = int(np.argmin(path.depths))
-    low, top = float(path.depths[least]), float(path.depths[least:].max())
+    outer, top = _outermost(probe, path), float(path.depths[int(np.argmin(path.depths)) :].max())
     first, last = float(path.depths[0]), float(path.depths[-1])
-    return min(first, top) > TOUCH and first - low > HALF * (top - low) > last - low
+    return min(first, top) > TOUCH and first - outer > HALF * (top - outer) > last - outer
+
+
+def _markers_stayed(probe: ProbeRecord, path: ProbeApproach) -> bool:
+    """Tell whether the markers are where they began when the probe is farthest away, while they move later: then it did
+    not press them at first."""
+    frames = probe.recording.uncorrected_marker_frames or probe.recording.marker_frames
+    moved, _ = without_noise(lasting(motion(frames)), np.nan)
+    if not moved.any():
+        return False
+    seconds: Array = np.array([1e-9 * (frame.stamp_ns - probe.recording.start_ns) for frame in frames])
+    farthest = float(path.seconds[int(np.argmin(path.depths))])
+    return bool(moved[int(np.argmin(np.abs(seconds - farthest)))] < SOME * moved.max())
 
 
 def _presses(recording: Recording, path: ProbeApproach, limit: float) -> list[tuple[float, float]]:
@@ -114,19 +146,23 @@ def _presses(recording: Recording, path: ProbeApproach, limit: float) -> list[tu
     return [(float(t[0]), float(t[-1])) for t in times if len(t)]
 
 
-def _force_shows(recording: Recording, path: ProbeApproach, at: float, limit: float) -> bool:
-    """Tell whether the force about ``at`` s is another one than in the air, where that is known, while the probe is
-    deeper than ``limit`` m."""
+def _force_shows(probe: ProbeRecord, path: ProbeApproach, at: float) -> bool | None:
+    """Tell whether the force about ``at`` s is another one than in the air, while the probe may touch; None where that
+    is not known, or where no force stands out of its scatter."""
+    recording, limit = probe.recording, probe.clear_limit
     near = np.interp(at, path.seconds, path.depths) > limit
     t = np.array([1e-9 * (wrench.stamp_ns - recording.start_ns) for wrench in recording.wrenches])
     here = np.abs(t - at) < AROUND
     if not near or not here.any():
-        return False
+        return None
     force = np.array([wrench.force for wrench in recording.wrenches])
     air = in_the_air(recording, depths_of(recording, path), path, limit)
     if not len(air):
-        return False
+        return None
     level = np.median(force[air], axis=0)
     size = float(np.linalg.norm(np.median(force[here], axis=0) - level))
     scatter = float(np.linalg.norm(force[air].std(axis=0))) / here.sum() ** 0.5
-    return bool(size > max(PRESSED * float(np.linalg.norm(force - level, axis=1).max()), SIGMAS * scatter))
+    least = PRESSED * float(np.percentile(np.linalg.norm(force - level, axis=1), LARGEST))
+    if size > max(least, SIGMAS * scatter):
+        return True
+    return False if SIGMAS * scatter < least else None

@@ -5,24 +5,31 @@ from __future__ import annotations
 import numpy as np
 
 from livedeform.common.checks.finding import Finding
+from livedeform.common.experiment.constants import OGDEN_1972, ogden_1972, shear_modulus_of
 from livedeform.common.experiment.schema import USED_SIGMAS, Experiment
-from livedeform.common.experiment.surface import Surface
+from livedeform.common.experiment.surface import Surface, read_surface
 
 COLLAPSE = 5.0  # weight of a column as high as the body over its modulus: all but flat layers are crushed by it
 STEEP = 1.0  # rad, of a tilt
 EARTH = (9.5, 10.1)  # m/s2
 LARGE = 0.1  # of the diagonal
+RELATIVE = 10.0  # Pa; constants that make a softer body than that can only be meant as ratios
+DIFFERS = 0.05  # of a shear modulus
+FLUSH = 1e-4  # m; as exactly a mesh may be expected to be drawn
 LET, METRES = "nearly nothing is wrong by that", "lengths are in metres: 2 mm is 0.002"
 
 
 def check_declared(experiment: Experiment, body: Surface) -> list[Finding]:
     """Doubt a body that its own weight crushes, a tilt of gravity that is in degrees and a gravity in another unit by
-    all likelihood, and errors that are large for this body; name the standard deviations that nothing uses."""
+    all likelihood, constants of a material that contradict its modulus, errors that are large for this body, and a
+    probe's mesh in another frame than the probe's; name the standard deviations that nothing uses."""
     return [
         *_weight(experiment, body),
+        *_constants(experiment),
         *_gravity(experiment),
         *_tilt(experiment),
         *_large_errors(experiment, body),
+        *_probe_frame(experiment),
         *_unused(experiment),
     ]
 
@@ -38,6 +45,25 @@ def _weight(experiment: Experiment, body: Surface) -> list[Finding]:
         f"under its own weight ({stress:.3g} Pa at its lowest point) a body with a modulus of {modulus:g} Pa collapses"
     )
     return [Finding("WARN", text, "give phantom.material.youngs_modulus in pascals: 4 kPa is 4000")]
+
+
+def _constants(experiment: Experiment) -> list[Finding]:
+    """Doubt constants in Pa that have another stiffness at small strain than E and nu: all are scaled to those."""
+    material = experiment.phantom.material
+    own = shear_modulus_of(material.model, material.parameters)
+    declared = material.youngs_modulus / (2.0 * (1.0 + material.poisson_ratio))
+    if own is None or own <= RELATIVE or abs(own / declared - 1.0) <= DIFFERS:
+        return []
+    given = ", ".join(key for key in ("mu", "c1", "c10", "c01") if key in material.parameters)
+    text = (
+        f"the constants of phantom.material ({given}) have a shear modulus of {own:.4g} Pa, youngs_modulus and "
+        f"poisson_ratio one of {declared:.4g} Pa: all constants are taken times {declared / own:.3g}"
+    )
+    remedy = f"give youngs_modulus as {own / declared * material.youngs_modulus:.4g}, or correct the constants"
+    if material.model == "ogden" and abs(sum(ogden_1972(material.parameters)) / declared - 1.0) <= DIFFERS:
+        values = ", ".join(f"{m:.4g}" for m in ogden_1972(material.parameters))
+        remedy = f"they fit by Ogden's own formula ({OGDEN_1972}): then give mu as [{values}]"
+    return [Finding("WARN", text, remedy)]
 
 
 def _gravity(experiment: Experiment) -> list[Finding]:
@@ -73,6 +99,19 @@ def _tilt(experiment: Experiment) -> list[Finding]:
                 text = f"the effect 'gravity_tilt' turns gravity by {angle:.3g} rad, {np.degrees(angle):.0f} degrees"
                 found.append(Finding("WARN", text, "give its angles in radians: 2 degrees are 0.035"))
     return found
+
+
+def _probe_frame(experiment: Experiment) -> list[Finding]:
+    """Doubt a probe's mesh whose contact face is not where its poses say it is: at z = 0, and nothing beyond."""
+    mesh = None if experiment.probe is None else experiment.probe.shape.mesh
+    end = 0.0 if mesh is None else float(read_surface(mesh).upper[2])
+    if abs(end) <= FLUSH:
+        return []
+    text = (
+        f"probe.shape.mesh ends at z = {1e3 * end:+.3g} mm, not at 0: the origin of the frame 'probe' is the middle of "
+        "the contact face, +z points out of it into the tissue, and only the rim of a hollow face lies at z > 0"
+    )
+    return [Finding("WARN", text, "move the mesh, or turn it, or leave it so if its face is hollow")]
 
 
 def _unused(experiment: Experiment) -> list[Finding]:

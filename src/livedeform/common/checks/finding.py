@@ -14,12 +14,14 @@ Severity = Literal["ERROR", "WARN", "NOTE"]
 @dataclass(frozen=True)
 class Finding:
     """``level`` ERROR: nothing can be concluded from it; WARN: it may be wrong; NOTE: worth knowing. ``remedy`` says
-    what to do. A finding that ``doubts`` keeps a run's verdict from being OK."""
+    what to do. A finding that ``doubts`` keeps a verdict from being sure: one ``of_forces``, which a diagnosis fits and
+    no number of a run reads, only that of a diagnosis."""
 
     level: Severity
     text: str
     remedy: str = ""
     doubts: bool = False
+    of_forces: bool = False
 
 
 def refuse_errors(findings: Iterable[Finding], where: str) -> None:

@@ -24,6 +24,8 @@ MOST_LOOKS = 200_000  # at where poses are, to find these
 TOUCH = 1e-3  # m: the body sags, and the samples are apart, by about that
 FAR = 2.0  # of the body's diagonal: a probe that stays that far away is in another frame or unit
 BACKWARDS = -0.5  # cosine between the probe's +z and the direction to the body: it looks away from it
+CLEAR = 2 * TOUCH  # m above the body, besides what it may sag: the probe does not touch
+ALONG = 0.7  # cosine between the way in which a probe presses and that in which the body sags
 
 
 @dataclass(frozen=True)
@@ -63,15 +65,46 @@ class SurfaceDistance:
         return np.asarray(-np.sign(offset) * size)
 
 
-def check_probe(recording: Recording, experiment: Experiment, body: Surface) -> list[Finding]:
+@dataclass(frozen=True)
+class ProbeRecord:
+    """The probe of a ``recording`` beside the ``body`` as it was given. All checks of one recording share it: what they
+    ask of half an hour of poses takes seconds, and is worked out once."""
+
+    recording: Recording
+    experiment: Experiment
+    body: Surface
+
+    @cached_property
+    def path(self) -> ProbeApproach | None:
+        """Return the probe's path (`probe_path`); None where no probe is declared, or no pose was recorded."""
+        probe, poses = self.experiment.probe, self.recording.poses
+        return probe_path(poses, probe.shape, self.body, self.recording.start_ns) if probe and poses else None
+
+    @cached_property
+    def sag(self) -> float:
+        """Say how far (m) the body's top may be from the given surface (`sag_bound`)."""
+        return sag_bound(self.experiment, self.body)
+
+    @cached_property
+    def clear_limit(self) -> float:
+        """Return the depth (m, negative) above which the probe may touch a body that sags: not where it presses the way
+        that the body sags, which is away from it."""
+        phantom = self.experiment.phantom
+        scanned = np.array(phantom.scan_gravity) if phantom.configuration == "loaded" else np.zeros(3)
+        pull = np.array(phantom.gravity) - scanned
+        axes = Rotation.from_quat([pose.orientation_xyzw for pose in self.recording.poses]).apply([0.0, 0.0, 1.0])
+        away = bool((axes @ pull > ALONG * np.linalg.norm(pull)).all()) and not self.experiment.timeline.release
+        return -(CLEAR + (0.0 if away else self.sag))
+
+
+def check_probe(probe: ProbeRecord) -> list[Finding]:
     """Findings about the probe's path; says when it touches and how deep it goes."""
-    if experiment.probe is None or not recording.poses:
+    path, diagonal = probe.path, probe.body.diagonal
+    if path is None:
         return []
-    path = probe_path(recording.poses, experiment.probe.shape, body, recording.start_ns)
-    diagonal = body.diagonal
     nearest, deepest = int(np.argmax(path.depths)), float(path.depths.max())
     if deepest < -FAR * diagonal:
-        return [_too_far(recording, experiment, body, deepest, diagonal)]
+        return [_too_far(probe.recording, probe.experiment, probe.body, deepest, diagonal)]
     # only near the body does the direction mean anything
     near = path.depths > max(deepest, -diagonal) - TOUCH
     if float(np.median(path.facing[near])) < BACKWARDS:
@@ -81,12 +114,7 @@ def check_probe(recording: Recording, experiment: Experiment, body: Surface) -> 
         at = path.seconds[nearest]
         text = f"the probe never touches the body: it stays {-1e3 * deepest:.1f} mm away (at {at:.1f} s)"
         return [Finding("WARN", text, "check the probe's poses and its shape", doubts=True)]
-    sag = sag_bound(experiment, body)
-    found = [_contact(path, nearest, sag)]
-    if path.depths[0] > TOUCH + sag:
-        text = f"the recording begins with the probe {1e3 * path.depths[0]:.1f} mm inside the body"
-        found.append(Finding("WARN", text, "begin the recording with the probe in the air", doubts=True))
-    return found
+    return [_contact(path, nearest, probe.sag)]
 
 
 def _contact(path: ProbeApproach, deepest: int, sag: float) -> Finding:
@@ -139,7 +167,9 @@ def probe_path(poses: list[Pose], shape: ProbeShape, body: Surface, start_ns: in
 
 def _evenly(first: int, last: int, most: int = MOST_POSES) -> NDArray[np.int64]:
     """Return numbers between two, these among them, of which there are at most so many."""
-    return np.unique(np.linspace(first, last, min(last - first + 1, most)).round().astype(np.int64))
+    if last - first < most:
+        return np.arange(first, last + 1)
+    return np.unique(np.linspace(first, last, most).round().astype(np.int64))
 
 
 def _nearest(poses: list[Pose], distance: SurfaceDistance) -> NDArray[np.int64]:

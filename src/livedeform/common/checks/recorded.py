@@ -16,7 +16,7 @@ from livedeform.common.checks.clocks import check_clocks
 from livedeform.common.checks.declared import check_declared
 from livedeform.common.checks.exchanged import check_exchanged
 from livedeform.common.checks.finding import Finding, Severity, refuse_errors
-from livedeform.common.checks.probe_path import check_probe
+from livedeform.common.checks.probe_path import ProbeRecord, check_probe
 from livedeform.common.checks.tared import check_tared
 from livedeform.common.errors import InputError
 from livedeform.common.experiment.plausibility import read_body
@@ -31,14 +31,18 @@ POSES_APART_NS = 500_000_000  # poses further apart are not interpolated, nor ar
 SAME = 0.5  # share of equal poses from which two recordings are one
 
 
-def check_recording(recording: Recording, experiment: Experiment) -> list[Finding]:
-    """Everything that can be told from the recording's numbers, without its pictures, and of what is declared."""
+def check_recording(recording: Recording, experiment: Experiment, *, is_part: bool = False) -> list[Finding]:
+    """Everything that can be told from the recording's numbers, without its pictures, and of what is declared. Of one
+    that ``is_part`` of a longer one who has that tells how it begins (`check_start`), and whether the probe touches."""
     body = read_body(experiment)
     checks: Sequence[Callable[[Recording, Experiment, Surface], list[Finding]]] = (
         check_faults, check_frames, check_ids, check_inputs, check_stamps, check_gaps, check_places, check_exchanges,
-        check_clocks, check_probe, check_beginning, check_tared, check_release, check_drifts,
+        check_clocks, check_release, check_drifts,
     )  # fmt: skip
     found = [finding for check in checks for finding in check(recording, experiment, body)]
+    probe = ProbeRecord(recording, experiment, body)
+    of_probe = [*([] if is_part else [check_probe, check_beginning]), check_tared]
+    found += [finding for check in of_probe for finding in check(probe)]
     return [*found, *check_declared(experiment, body)]
 
 
@@ -78,8 +82,8 @@ def check_inputs(recording: Recording, experiment: Experiment, body: Surface) ->
 FAULTS: dict[str, tuple[Severity, str, str]] = {
     "no_id": ("ERROR", f"{t.STEREO_MARKERS} has no field 'id': nothing says which marker is which",
               "record PointCloud2 with the fields x, y, z and id"),
-    "covariance": ("WARN", "covariances that are negative, infinite or incomplete are taken as unknown",
-                   "correct the tracker's covariances"),
+    "covariance": ("WARN", "covariances that are zero, negative, infinite or incomplete are taken as unknown",
+                   "correct the tracker's covariances, or leave all six fields out"),
     "stamp": ("WARN", "messages whose stamp cannot be right are left out", "check the clocks"),
     "stretch": ("WARN", "messages whose stamp cannot be right are left out, several in a row",
                 "record again, with clocks that are set before"),
@@ -256,7 +260,8 @@ def load_checked(fit: Sequence[Path], test: Sequence[Path], experiment: Experime
         findings = [*check_named(recording, experiment), *check_recording(recording, acting)]
         refuse_errors(findings, str(path))
         said = [finding.text for finding in findings if finding.level == "WARN"]
-        loaded.append(replace(recording, warnings=[*recording.warnings, *said]))
+        doubts = [finding.text for finding in findings if finding.doubts and finding.of_forces]
+        loaded.append(replace(recording, warnings=[*recording.warnings, *said], force_doubts=doubts))
     refuse_overlap(
         list(zip(fit, loaded[: len(fit)], strict=True)),
         list(zip(test, loaded[len(fit) :], strict=True)),

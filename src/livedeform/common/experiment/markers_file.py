@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import re
+import unicodedata
 from collections.abc import Sequence
 from difflib import SequenceMatcher
 from pathlib import Path
@@ -71,7 +72,7 @@ def _columns(names: Sequence[str], path: Path) -> list[str]:
     if doubled:
         raise InputError(f"column {', '.join(doubled)} is there twice", where=str(path), remedy="delete one of them")
     for wanted in OPTIONAL:
-        near = [name for name in columns if name != wanted and _mistyped(name.lower(), wanted)]
+        near = [name for name in columns if name != wanted and _mistyped(name, wanted)]
         if near and wanted not in columns:
             what, meant = f"a column '{near[0]}' is not read", f"call it {wanted} (lengths in metres) if that is meant"
             raise InputError(what, where=str(path), remedy=f"{meant}, or else otherwise")
@@ -79,11 +80,12 @@ def _columns(names: Sequence[str], path: Path) -> list[str]:
 
 
 def _mistyped(name: str, wanted: str) -> bool:
-    """Tell whether a name is the wanted one with a unit behind it, with letters exchanged, or with one too many or too
-    few."""
-    if re.fullmatch(rf"{wanted}[ _.(\[]+(mm|cm|m|um|µm)[)\]]?", name):
+    """Tell whether a column is the wanted one in other signs, with a unit or anything else behind it, with letters
+    exchanged, or with one too many or too few. One of a single axis (sigma_x) is another."""
+    plain = unicodedata.normalize("NFKC", name).lower().replace("\u03c3", "sigma")
+    if wanted == "sigma" and plain.startswith(wanted) and not re.fullmatch(r"sigma[ _]?[xyz]", plain):
         return True
-    return sorted(name) == sorted(wanted) or SequenceMatcher(None, name, wanted).ratio() > NEAR
+    return sorted(plain) == sorted(wanted) or SequenceMatcher(None, plain, wanted).ratio() > NEAR
 
 
 def no_markers() -> Markers:

@@ -172,7 +172,9 @@ def _check_lengths(experiment: Experiment, surface: Surface) -> None:
         if length > across:
             _refuse_length(_where(experiment, key), key.rpartition(".")[2], length, surface)
     for key, sizes in [] if experiment.probe is None else experiment.probe.shape:
-        size = float(np.max(sizes)) if sizes and key != "mesh" else 0.0
+        if sizes is None:
+            continue
+        size = float(np.ptp(read_surface(sizes).vertices, axis=0).max() if key == "mesh" else np.max(sizes))
         if size > _far(surface):
             _refuse_length(_where(experiment, f"probe.shape.{key}"), key, size, surface)
 

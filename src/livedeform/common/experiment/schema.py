@@ -36,6 +36,7 @@ from pydantic import (
 )
 from pydantic_core import PydanticCustomError
 
+from livedeform.common.experiment.constants import nonsense_of
 from livedeform.common.published_effects import EFFECT_PARAMETERS, KEEP_ONE, OPTIONAL_PARAMETERS, doubled, impossible
 from livedeform.common.types import Array, EffectValues, Ids
 
@@ -365,8 +366,9 @@ class Material(Section):
                 raise problem(f"unknown key '{key}' of the model {self.model}", remedy)
             if not _are_numbers(value):
                 raise problem(f"'{key}' is {value!r}", "write a number or a list of numbers")
-        if wrong := _nonsense_of(self.model, self.parameters):
-            raise problem(wrong, "correct the constant: such a material has no stiffness")
+        wrong, remedy = nonsense_of(self.model, self.parameters)
+        if wrong:
+            raise problem(wrong, remedy)
         for pair in TOGETHER:
             if len(set(pair) & set(self.parameters)) == 1:
                 raise problem(f"only one of {' and '.join(pair)} is given", "give both, or neither")
@@ -376,21 +378,6 @@ class Material(Section):
     def parameters(self) -> dict[str, Any]:
         """The model's own constants (extra keys of the file)."""
         return dict(self.model_extra or {})
-
-
-def _nonsense_of(model: str, constants: Mapping[str, Any]) -> str:
-    """Return what is physically impossible about a model's own constants; empty where nothing is."""
-    for key in ("c1", "b", "ratio"):
-        if key in constants and not np.all(np.asarray(constants[key], float) >= 0.0):
-            return f"'{key}' of the model {model} is {constants[key]}, and cannot be negative"
-    if "c10" in constants and "c01" in constants and constants["c10"] + constants["c01"] <= 0.0:
-        return f"c10 + c01 of the model {model} is not positive"
-    mu, alpha = (np.atleast_1d(constants.get(key, 1.0)) for key in ("mu", "alpha"))
-    if len(mu) != len(alpha) and {"mu", "alpha"} <= constants.keys():
-        return f"the model {model} has {len(mu)} constants mu and {len(alpha)} alpha: each term has one of both"
-    if model == "ogden" and {"mu", "alpha"} <= constants.keys() and float(mu @ alpha) <= 0.0:
-        return f"the sum of mu alpha of the model {model} is not positive"
-    return ""
 
 
 def _are_numbers(value: Any) -> bool:

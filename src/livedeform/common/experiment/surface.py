@@ -12,6 +12,7 @@ from livedeform.common.errors import MeshError
 from livedeform.common.types import Array
 
 METRES_PER_UNIT = {"m": 1.0, "mm": 1e-3}
+LOOSE = 0.5  # of the edges; of an open scan only those at its rims belong to one triangle
 
 
 @dataclass(frozen=True)
@@ -144,8 +145,8 @@ def _boundary(points: Array, tets: NDArray[np.int64]) -> NDArray[np.int64]:
 
 def check_closed(triangles: NDArray[np.int64], path: Path) -> None:
     """Every edge of a closed surface belongs to an even number of triangles; ``MeshError`` with the count if not."""
-    edges = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2).astype(np.int64), axis=1)
-    _, count = np.unique(edges @ [int(triangles.max()) + 1, 1], return_counts=True)
+    refuse_loose(triangles, str(path))
+    count = _triangles_at_edges(triangles)
     n_open = int((count % 2 == 1).sum())
     if n_open:
         raise MeshError(
@@ -153,3 +154,21 @@ def check_closed(triangles: NDArray[np.int64], path: Path) -> None:
             where=str(path),
             remedy="close the holes, for example with MeshLab's 'Close Holes'",
         )
+
+
+def refuse_loose(triangles: NDArray[np.int64], where: str) -> None:
+    """``MeshError`` for triangles (k, 3) most of which hang together with no other: they have no holes to close."""
+    count = _triangles_at_edges(triangles)
+    loose = int((count == 1).sum())
+    if loose > LOOSE * len(count):
+        raise MeshError(
+            f"the triangles do not hang together: {loose} of {len(count)} edges belong to one alone",
+            where=where,
+            remedy="join corners that lie close to one another, for example with MeshLab's 'Merge Close Vertices'",
+        )
+
+
+def _triangles_at_edges(triangles: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return how many triangles (e,) each edge belongs to."""
+    edges = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2).astype(np.int64), axis=1)
+    return np.asarray(np.unique(edges @ [int(triangles.max()) + 1, 1], return_counts=True)[1], np.int64)

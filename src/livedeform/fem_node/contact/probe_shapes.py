@@ -16,7 +16,8 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from livedeform.common.compiled import njit
-from livedeform.common.errors import InputError
+from livedeform.common.errors import InputError, MeshError
+from livedeform.common.experiment.surface import check_closed, read_surface
 from livedeform.common.types import Array
 from livedeform.fem_node.mesh.triangle_distance import TriangleTree, closest_features
 
@@ -218,13 +219,20 @@ def _make_sphere(size, edge_radius: float) -> Shape:
 
 
 def _make_mesh(size, edge_radius: float) -> Shape:
-    if isinstance(size, str | Path):
-        from livedeform.fem_node.mesh.generate import read_surface
+    """Return a closed mesh as a solid, whichever way its triangles look: inside out it would push from within."""
+    from livedeform.fem_node.mesh.repair.shells import outermost
+    from livedeform.fem_node.mesh.surface import LARGEST, SMALLEST
 
-        vertices, triangles = read_surface(Path(size), "m")
-    else:
-        vertices, triangles = size
-    return TriangleSolid(np.asarray(vertices, dtype=float), np.asarray(triangles, dtype=np.int64))
+    where = "probe.shape.mesh"
+    if isinstance(size, str | Path):
+        where, surface = str(size), read_surface(Path(size))
+        size = surface.vertices, surface.triangles
+    vertices, triangles = np.asarray(size[0], dtype=float), np.asarray(size[1], dtype=np.int64)
+    check_closed(triangles, Path(where))
+    across = float(np.linalg.norm(np.ptp(vertices, axis=0)))
+    if not SMALLEST <= across <= LARGEST:
+        raise MeshError(f"the probe is {across:.4g} m across", where=where, remedy="scale the file: it is in metres")
+    return TriangleSolid(vertices, outermost(vertices, triangles))
 
 
 def _rounded_orthant(q: Array) -> tuple[Array, Array, Array]:

@@ -57,6 +57,12 @@ class StillBonded:
             return inside
         return inside & (self._inside_of_edge(points, points[inside]) > 0.0)
 
+    def ramp(self, base: Array, width: float) -> float:
+        """Return over how many m the bond fades on a ``base`` (m, 3): ``width``, but no farther beyond the edge than
+        the base goes, so that the less of it is free the less it fades."""
+        beyond = -float(self._inside_of_edge(base, base).min()) if self.fraction > 0.0 else 0.0
+        return min(width, 2.0 * max(beyond, 0.0))
+
     def share(self, points: Array, base: Array, width: float) -> Array:
         """Return how far (n,) from 0, free, to 1, held, the bond is at ``points`` (n, 3) of a ``base`` (m, 3): a ramp
         ``width`` m wide over the edge."""

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from livedeform.common.errors import InputError
 from livedeform.common.types import Array
-from livedeform.fem_node.element.element import Space, shape_values
+from livedeform.fem_node.element.element import Space
 from livedeform.fem_node.element.kernels import (
     add_stiffness,
     deformation_gradients,
@@ -27,7 +27,7 @@ from livedeform.fem_node.element.kernels import (
     upper_positions,
 )
 from livedeform.fem_node.element.simd import LANES, work_array
-from livedeform.fem_node.element.subcells import averaged, middles, splits
+from livedeform.fem_node.element.subcells import SubCells, averaged, splits
 from livedeform.fem_node.element.volume_scheme import make_scheme
 from livedeform.fem_node.items import plastic, viscoelastic
 from livedeform.fem_node.items.dynamics import SLIP, moves
@@ -76,7 +76,7 @@ class Continuum(PlainItem):
             self._dofs = np.concatenate([self._dofs, 3 * space.n_nodes + space.mesh.tets], axis=1)
         self._positions: Positions = np.zeros((0, 0, 0), np.int32)
         self._factor, self._steady = np.ones((e, q)), np.ones((e, q))  # of the modulus; and what of it does not change
-        self._parts = np.zeros((e, 0, 3))
+        self._parts: SubCells | None = None
         self._growth = 1.0
         self._history = self._begin_history(e * q)
         self._step: viscoelastic.Step | None = None
@@ -126,10 +126,8 @@ class Continuum(PlainItem):
         shape = BodyShape(nodes[: len(s.mesh.nodes)], s.mesh.boundary_triangles, held_facets(s, self.physics))
         self._fields = bind_fields(self.physics.modulus_fields, shape)
         if any(field.jumps for field in self._fields):
-            values = shape_values(middles(splits(s.typical_size)), quadratic=s.quadratic)
-            self._parts = np.einsum(
-                "pa,eai->epi", values, (s.nodes if unloaded is None else s.nodes + unloaded)[s.cells]
-            )
+            places = (s.nodes if unloaded is None else s.nodes + unloaded)[s.cells]
+            self._parts = SubCells(places, splits(s.typical_size), s.quadratic)
         self._steady = np.ones(s.weights.shape)
         for field in self._fields:
             if not field.changes_with_time:
@@ -138,10 +136,9 @@ class Continuum(PlainItem):
 
     def _factor_of(self, field: ModulusField, time: float) -> Array:
         """Return a field's factor of the modulus (e, q)."""
-        places = self._parts if field.jumps else self.unloaded_points
-        factor = field(places.reshape(-1, 3), time).reshape(places.shape[:2])
-        if not field.jumps:
-            return factor
+        if self._parts is None or not field.jumps:
+            return field(self.unloaded_points.reshape(-1, 3), time).reshape(self.space.weights.shape)
+        factor = field.over(self._parts, time).reshape(len(self.space.weights), -1)
         weights = self.space.weights[0]  # of straight elements: the rule's own, times the volume
         return averaged(factor, self.space.barycentric, weights / weights.sum())
 
@@ -181,12 +178,20 @@ class Continuum(PlainItem):
         """Young's modulus Pa of the elements at the surface that no support holds: the geometric mean over it, without
         what changes with time."""
         E, s = self.physics.material.youngs_modulus, self.space
-        free = ~held_facets(s, self.physics)
-        if not self._fields or not free.any():
+        free = np.flatnonzero(~held_facets(s, self.physics))
+        if not self._fields or not len(free):
             return E
         _, area, _ = s.facet_rule(1)
-        logarithm = np.log(self._steady[s.mesh.boundary_tets[free]]).mean(axis=1)
-        return E * float(np.exp(np.average(logarithm, weights=area[free].sum(axis=1))))
+        return E * float(np.exp(np.average(self._logarithm(self._steady, free), weights=area[free].sum(axis=1))))
+
+    def modulus_behind(self, facets: NDArray[np.int64]) -> Array:
+        """Return Young's modulus (f,) Pa of the elements behind boundary ``facets`` (f,), at the prepared moment."""
+        E = self.physics.material.youngs_modulus
+        return E * np.exp(self._logarithm(self._factor, facets)) if self._fields else np.full(len(facets), E)
+
+    def _logarithm(self, factor: Array, facets: NDArray[np.int64]) -> Array:
+        """Return the mean logarithm (f,) of a ``factor`` (e, q) over the elements behind boundary ``facets`` (f,)."""
+        return np.asarray(np.log(factor[self.space.mesh.boundary_tets[facets]]).mean(axis=1))
 
     @property
     def mass_weights(self) -> Array:

@@ -4,11 +4,14 @@ Springs are slack, and friction has not yet slipped, in the unloaded shape: the 
 support before weight acted on it. So a body that was scanned under its weight stretches them, and ever stiffer springs
 become the fixed support. With springs that are slack in the scanned shape, a loaded scan would sag on a base without
 any hold, however stiff they are.
+
+Springs that stand for a bond go by the modulus of the body behind them, with whatever effects make of it: were they
+declared ones, a body that an effect softens would hang on a bond that is stiffer than it ends.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -21,7 +24,7 @@ from livedeform.common.errors import InputError
 from livedeform.common.types import Array
 from livedeform.fem_node.element.element import Space
 from livedeform.fem_node.items.loads import facets_in
-from livedeform.fem_node.items.protocol import Item, PlainItem
+from livedeform.fem_node.items.protocol import Item, Moment, PlainItem
 from livedeform.fem_node.physics.record import PartialRegion, Physics, Support
 from livedeform.fem_node.solve.assembly import Pattern, System, node_dofs
 
@@ -39,41 +42,67 @@ DEGREE = 4  # of the quadrature of springs
 # where a bond ends (`_partly_held`): width of the ramp in elements, springs in units of E / element size
 EDGE, EDGE_STIFF = 0.5, 20.0
 
+# the modulus (f,) Pa behind boundary facets, by their numbers (f,), at the moment for which the body is prepared
+Behind = Callable[[NDArray[np.int64]], Array]
+# springs' stiffness along the normal and along the surface, Pa/m, each one number, (f, 1) or (f, q), by that modulus
+# as (f, 1)
+Law = Callable[[Array], tuple[Array | float, Array | float]]
 
-def make_supports(space: Space, physics: Physics, unloaded: Array | None = None) -> list[Item]:
-    """Return the items of all supports; ``unloaded`` (n, 3) m: displacement from the scanned to the unloaded shape."""
+
+def make_supports(space: Space, physics: Physics, behind: Behind, unloaded: Array | None = None) -> list[Item]:
+    """Return the items of all supports, of a body with the modulus ``behind`` its facets; ``unloaded`` (n, 3) m:
+    displacement from the scanned to the unloaded shape."""
     items: list[Item] = []
-    for number, support in enumerate(physics.supports):
-        where = f"support {number} ({support.type})"
+    for number, declared in enumerate(physics.supports):
+        where = f"support {number} ({declared.type})"
+        support = _without_trifles(space, declared)
         nodes = supported_nodes(space, support)
         if len(nodes) == 0:
             raise InputError("no surface node lies in the region", where=where, remedy="enlarge the region")
-        if partly := _partly_held(space, physics, support):
+        if partly := _partly_held(space, support, behind):
             items += partly
             continue
         if support.type == "fixed":
             items.append(Held(node_dofs(nodes[:, None]).ravel()))
             continue
         face = supported_face(space, support)
-        facets, axis = space.facets[face.facets], face.axis
-        scale = physics.material.youngs_modulus / space.typical_size
         if support.type == "friction":
-            tangential = support.stiffness or 100.0 * scale
-            items.append(FrictionSupport(space, facets, _STIFF * scale, tangential, support.mu, face.normal))
+            items.append(FrictionSupport(space, face, _friction_law(support, space.typical_size), support.mu, behind))
             continue
-        if axis is not None:
-            items.append(Held(3 * face.nodes + axis))
-        normal = 0.0 if axis is not None else _STIFF * scale
-        if normal or support.type == "spring":
-            sideways = support.stiffness if support.type == "spring" else 0.0
-            items.append(Springs(space, facets, normal, sideways, along=face.normal))
+        if face.axis is not None:
+            items.append(Held(3 * face.nodes + face.axis))
+        if face.axis is None or support.type == "spring":
+            items.append(Springs(space, face, _whole_law(support, face, space.typical_size), behind))
     set_unloaded(items, unloaded)
     return items
 
 
-def _partly_held(space: Space, physics: Physics, support: Support) -> list[Item]:
+def _friction_law(support: Support, size: float) -> Law:
+    """Return the springs of a support with friction, on elements of ``size`` m, while it sticks."""
+    return lambda modulus: (_STIFF * modulus / size, support.stiffness or 100.0 * modulus / size)
+
+
+def _whole_law(support: Support, face: Face, size: float) -> Law:
+    """Return the springs of a sliding or springy support: along the normal where that is not held exactly."""
+    sideways = support.stiffness if support.type == "spring" else 0.0
+    return lambda modulus: (_STIFF * modulus / size if face.axis is None else 0.0, sideways)
+
+
+def _without_trifles(space: Space, support: Support) -> Support:
+    """Return the whole support for one of which so little is free that its edge would be stiffer than a bond that holds
+    along curved normals; any other as it is."""
+    region = support.region
+    if not isinstance(region, PartialRegion):
+        return support
+    whole, usual = replace(support, region=region.region), EDGE * space.typical_size
+    base = space.nodes[supported_nodes(space, whole)]
+    return whole if len(base) and region.ramp(base, usual) <= usual * EDGE_STIFF / _STIFF else support
+
+
+def _partly_held(space: Space, support: Support, behind: Behind) -> list[Item]:
     """Make the items of a bond, or of springs, that end somewhere: nodes well inside are held, and up to the edge
-    springs fade away, so that the body changes smoothly as the edge moves through the elements. Nothing for a whole
+    springs fade away, so that the body changes smoothly as the edge moves through the elements. Where the edge is so
+    near the end that they have less room, they are as much stiffer, and so become the bond. Nothing for a whole
     one."""
     region = support.region
     if support.type not in ("fixed", "spring") or not isinstance(region, PartialRegion):
@@ -81,33 +110,36 @@ def _partly_held(space: Space, physics: Physics, support: Support) -> list[Item]
     whole = replace(support, region=region.region)
     face, nodes = supported_face(space, whole), supported_nodes(space, whole)
     facets = space.facets[face.facets]
-    base, width = space.nodes[nodes], EDGE * space.typical_size
+    base, usual = space.nodes[nodes], EDGE * space.typical_size
+    width = region.ramp(base, usual)
     held = nodes[region.share(base, base, width) >= 1.0]
     values, _, _ = space.facet_rule(DEGREE, facets)
     places = np.einsum("qa,kai->kqi", values, space.nodes[facets])
     share = region.share(places.reshape(-1, 3), base, width).reshape(places.shape[:2])
-    scale = physics.material.youngs_modulus / space.typical_size
+    edge = EDGE_STIFF / space.typical_size * usual / width
     if support.type == "spring":
-        return _partly_sprung(space, face, np.intersect1d(held, face.nodes), share, support.stiffness, scale)
-    springs = Springs(space, facets, EDGE_STIFF * scale, EDGE_STIFF * scale, share)
+        return _partly_sprung(space, face, np.intersect1d(held, face.nodes), share, support.stiffness, edge, behind)
+    springs = Springs(space, face, lambda modulus: (share * edge * modulus, share * edge * modulus), behind)
     return [Held(node_dofs(held[:, None]).ravel()), springs] if len(held) else [springs]
 
 
 def _partly_sprung(
-    space: Space, face: Face, held: NDArray[np.int64], share: Array, stiffness: float, scale: float
+    space: Space, face: Face, held: NDArray[np.int64], share: Array, stiffness: float, edge: float, behind: Behind
 ) -> list[Item]:
     """Make springs of ``stiffness`` Pa/m along a face that is there to a ``share`` (f, q), and what holds it along its
-    normal, at the nodes ``held`` and up to the edge; ``scale``: modulus over size of the elements, Pa/m."""
+    normal, at the nodes ``held`` and up to the edge; ``edge``: what the springs of a bond's edge are of the modulus,
+    1/m."""
 
-    def faded(k: float) -> Array:  # in series with the edge of a bond, which the stiffest springs come to
-        return np.asarray(share * k / (1.0 + (1.0 - share) * k / (EDGE_STIFF * scale)))
+    def faded(k: Array | float, modulus: Array) -> Array:  # in series with a bond's edge, which the stiffest come to
+        return np.asarray(share * k / (1.0 + (1.0 - share) * k / (edge * modulus)))
 
-    facets = space.facets[face.facets]
-    sideways = Springs(space, facets, 0.0, 1.0, faded(stiffness), along=face.normal)
+    def whole(modulus: Array) -> tuple[Array, Array]:
+        return faded(_STIFF * modulus / space.typical_size, modulus), faded(stiffness, modulus)
+
     if face.axis is None:
-        return [Springs(space, facets, 1.0, 0.0, faded(_STIFF * scale), along=face.normal), sideways]
-    edge = Springs(space, facets, EDGE_STIFF * scale, 0.0, share, along=face.normal)
-    return [Held(3 * held + face.axis), edge, sideways] if len(held) else [edge, sideways]
+        return [Springs(space, face, whole, behind)]
+    springs = Springs(space, face, lambda modulus: (share * edge * modulus, faded(stiffness, modulus)), behind)
+    return [Held(3 * held + face.axis), springs] if len(held) else [springs]
 
 
 def set_unloaded(items: Sequence[Item], unloaded: Array | None) -> None:
@@ -231,30 +263,34 @@ class Held(PlainItem):
 
 
 class Springs(PlainItem):
-    """W = 1/2 int k_n (v.n)^2 + k_t |v - (v.n) n|^2 over the surface (scanned normals), k in Pa/m; v = u - w is the
-    displacement from the unloaded shape. ``share`` (f, q) of k at the quadrature points; ``along`` (3,): n of a flat
-    face, instead of each facet's own."""
+    """W = 1/2 int k_n (v.n)^2 + k_t |v - (v.n) n|^2 over the ``face`` (scanned normals: its own, or each facet's); v =
+    u - w is the displacement from the unloaded shape. The ``law`` gives k_n and k_t, Pa/m, by the modulus ``behind``.
+    """
 
-    def __init__(
-        self,
-        space: Space,
-        facets: NDArray[np.int64],
-        normal: float,
-        tangential: float,
-        share: Array | float = 1.0,
-        along: Array | None = None,
-    ) -> None:
-        values, weights, normals = space.facet_rule(DEGREE, facets)
-        if along is not None:
-            normals = np.broadcast_to(along, normals.shape)
-        weights = weights * share
-        nn = normals[:, :, None] * normals[:, None, :]
-        stiffness = normal * nn + tangential * (np.eye(3) - nn)
-        mass = np.einsum("kq,qa,qb->kab", weights, values, values)
-        n = 3 * facets.shape[1]
-        self._blocks = np.einsum("kab,kij->kaibj", mass, stiffness).reshape(-1, n, n)
+    def __init__(self, space: Space, face: Face, law: Law, behind: Behind) -> None:
+        facets = space.facets[face.facets]
+        self._values, self._weights, normals = space.facet_rule(DEGREE, facets)
+        if face.normal is not None:
+            normals = np.broadcast_to(face.normal, normals.shape)
+        self._normals = normals[:, :, None] * normals[:, None, :]
         self._dofs = node_dofs(facets)
         self._slack = np.zeros(self._dofs.shape)
+        self._facets, self._law, self._behind = face.facets, law, behind
+        self._modulus, self._blocks = np.zeros(0), np.zeros((0, 0, 0))
+
+    def prepare(self, moment: Moment) -> None:
+        """Take the stiffness that the body behind has now."""
+        modulus = self._behind(self._facets)
+        if np.array_equal(modulus, self._modulus):
+            return
+        normal, tangential = self._law(modulus[:, None])
+        along, across = (
+            np.einsum("kq,qa,qb->kab", self._weights * k, self._values, self._values) for k in (normal, tangential)
+        )
+        n = self._dofs.shape[1]
+        blocks = np.einsum("kab,kij->kaibj", along, self._normals)
+        blocks += np.einsum("kab,kij->kaibj", across, np.eye(3) - self._normals)
+        self._modulus, self._blocks = modulus, blocks.reshape(-1, n, n)
 
     def set_unloaded(self, unloaded: Array | None) -> None:
         """Take where the springs are slack: displacement (n, 3) m from the scanned shape, None: the scanned shape
@@ -281,24 +317,22 @@ class FrictionSupport(PlainItem):
     (Wriggers 2006, sec. 5.2 and 6.3).
     """
 
-    def __init__(
-        self,
-        space: Space,
-        facets: NDArray[np.int64],
-        normal: float,
-        tangential: float,
-        mu: float,
-        along: Array | None = None,
-    ) -> None:
+    def __init__(self, space: Space, face: Face, law: Law, mu: float, behind: Behind) -> None:
+        facets = space.facets[face.facets]
         self._values, self._weights, normals = space.facet_rule(2, facets)
-        if along is not None:
-            normals = np.broadcast_to(along, normals.shape)
+        if face.normal is not None:
+            normals = np.broadcast_to(face.normal, normals.shape)
         self._normals = np.repeat(normals, len(self._values), axis=0).reshape(len(facets), -1, 3)
-        self._k_n, self._k_t, self._mu = normal, tangential, mu
+        self._mu, self._law, self._behind, self._numbers = mu, law, behind, face.facets
         self._facets, self._dofs = facets, node_dofs(facets)
         self._limit = np.full(self._weights.shape, np.inf)  # mu p, Pa; it sticks until the pressure is known
         self._slip = np.zeros((*self._weights.shape, 3))
         self._slack = np.zeros(self._dofs.shape)
+
+    def prepare(self, moment: Moment) -> None:
+        """Take the stiffness (f, 1) Pa/m, along the normal and while it sticks, that the body behind has now."""
+        modulus = self._behind(self._numbers)[:, None]
+        self._k_n, self._k_t = (np.broadcast_to(k, modulus.shape) for k in self._law(modulus))
 
     def set_unloaded(self, unloaded: Array | None) -> None:
         """Take where nothing has slipped: displacement (n, 3) m from the scanned shape, None: the scanned shape
@@ -321,13 +355,13 @@ class FrictionSupport(PlainItem):
         slips = trial > self._limit
         limit = np.where(slips, self._limit, 0.0)
         secant = np.where(slips, limit / np.maximum(length, 1e-300), self._k_t)
-        traction = self._k_n * normal[..., None] * self._normals + secant[..., None] * gap
+        traction = (self._k_n * normal)[..., None] * self._normals + secant[..., None] * gap
         system.add_vectors(
             self._dofs, np.einsum("kq,qa,kqi->kai", self._weights, self._values, traction).reshape(len(self._dofs), -1)
         )
         if tangent:
             nn = self._normals[..., :, None] * self._normals[..., None, :]
-            D = self._k_n * nn + secant[..., None, None] * (np.eye(3) - nn)
+            D = self._k_n[..., None, None] * nn + secant[..., None, None] * (np.eye(3) - nn)
             d = gap / np.maximum(length, 1e-300)[..., None]
             D -= np.where(slips, secant, 0.0)[..., None, None] * d[..., :, None] * d[..., None, :]
             n = self._dofs.shape[1]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from livedeform.common.errors import InputError
+from livedeform.common.experiment.constants import nonsense_of
 from livedeform.fem_node.materials import (
     corotational,
     exponential,
@@ -31,8 +32,11 @@ MATERIALS = {
 
 
 def make_material(spec: MaterialSpec) -> Material:
-    """Return the material of a specification."""
+    """Return the material of a specification; ``InputError`` for an unknown model, or constants that cannot be."""
     if spec.model not in MATERIALS:
         raise InputError(f"unknown material model '{spec.model}'", remedy=f"use one of {', '.join(MATERIALS)}")
+    wrong, remedy = nonsense_of(spec.model, spec.extra)
+    if wrong:
+        raise InputError(wrong, remedy=remedy)
     material: Material = MATERIALS[spec.model].make(spec)
     return material

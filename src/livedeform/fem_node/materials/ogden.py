@@ -1,14 +1,16 @@
-"""Ogden: W = sum_p 2 mu_p / alpha_p^2 (l1^a + l2^a + l3^a - 3) + K/2 (J - 1)^2, l = J^-1/3 principal stretches (Ogden
-1972).
+"""Ogden: W = sum_p 2 mu_p / alpha_p^2 (l1^a + l2^a + l3^a - 3) + K/2 (J - 1)^2, l = J^-1/3 principal stretches (after
+Ogden 1972).
 
 ``mu`` and ``alpha`` are lists; sum(mu) is rescaled to the shear modulus of E and nu, so that effects on the modulus
-act on all.
+act on all. No mu_p is negative; alpha_p may be. Constants of Ogden's own formula, W = sum_p mu_p / alpha_p (...), are
+given as mu_p alpha_p / 2.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
+from livedeform.common.experiment.constants import shear_modulus_of
 from livedeform.common.types import Array
 from livedeform.fem_node.element.simd import side_by_side
 from livedeform.fem_node.materials.base import Material
@@ -22,7 +24,7 @@ def make(spec: MaterialSpec) -> Material:
     2)."""
     alpha = np.atleast_1d(np.asarray(spec.extra.get("alpha", [2.0]), float))
     weights = np.atleast_1d(np.asarray(spec.extra.get("mu", np.ones(len(alpha))), float))
-    mu = spec.shear_modulus * weights / weights.sum()
+    mu = spec.shear_modulus * weights / (shear_modulus_of(spec.model, {"mu": weights}) or 1.0)
 
     def response(F: Array, factor: Array, psi: Array, P: Array, A: Array | None) -> None:
         _response(F, factor, mu, alpha, psi, P, A)

@@ -6,6 +6,7 @@ together with ``c1`` in Pa, and then scale with E.
 
 from __future__ import annotations
 
+from livedeform.common.experiment.constants import shear_modulus_of
 from livedeform.common.types import Array
 from livedeform.fem_node.materials.base import Invariants, Material, invariant_response
 from livedeform.fem_node.physics.record import MaterialSpec
@@ -15,7 +16,7 @@ def make(spec: MaterialSpec) -> Material:
     """Take mu and K from E and nu; c2 and c3 relative to c1."""
     mu = spec.shear_modulus
     c1 = 0.5 * mu
-    scale = c1 / float(spec.extra.get("c1", c1))
+    scale = mu / (shear_modulus_of(spec.model, spec.extra) or mu)
     c2 = float(spec.extra.get("c2", 0.0)) * scale + float(spec.extra.get("c2_ratio", 0.0)) * c1
     c3 = float(spec.extra.get("c3", 0.0)) * scale + float(spec.extra.get("c3_ratio", 0.0)) * c1
 

@@ -10,6 +10,7 @@ import numpy as np
 import trimesh
 
 from livedeform.common.errors import MeshError
+from livedeform.common.experiment.surface import refuse_loose
 from livedeform.common.types import Array
 from livedeform.fem_node.mesh.quality import surface_distances
 from livedeform.fem_node.mesh.repair.crossings import crossing_pairs
@@ -98,6 +99,7 @@ def closed_surface(vertices: Array, triangles: IntArray, element_size: float, wh
     """The body that a surface (vertices (n, 3) m, triangles (k, 3)) means: loose specks dropped, holes up to an element
     across filled, pieces turned outward; ``MeshError`` with the reason where that would need guessing."""
     repairs: list[Repair] = []
+    refuse_loose(triangles, where)
     triangles = without_specks(vertices, turned_alike(vertices, triangles, repairs), repairs, element_size)
     vertices, triangles = _fill_holes(*_clean(vertices, triangles), HOLE * element_size, where, repairs)
     triangles = turned_outward(vertices, triangles, where, repairs)

@@ -14,6 +14,7 @@ from livedeform.common.compiled import njit
 from livedeform.common.errors import MeshError
 from livedeform.common.experiment.smooth_surface import corner_normals
 from livedeform.common.types import Array
+from livedeform.fem_node.mesh.facing import facing
 from livedeform.fem_node.mesh.triangle_distance import closest_on_triangle
 
 IntArray = NDArray[np.int64]
@@ -98,6 +99,11 @@ class TetMesh:
     def corner_normals(self) -> Array:
         """(k, 3, 3) at the corners of the boundary triangles, of the smooth surface that they stand for."""
         return corner_normals(self.nodes, self.boundary_triangles)
+
+    @cached_property
+    def facing_triangles(self) -> IntArray:
+        """(f,) rows of the boundary triangles that look at one another across a gap: none of most bodies."""
+        return facing(self.nodes, self.boundary_triangles)
 
     @cached_property
     def boundary_nodes(self) -> IntArray:

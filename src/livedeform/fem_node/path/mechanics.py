@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ from numpy.typing import NDArray
 from livedeform.common.errors import ConvergenceError
 from livedeform.common.types import Array
 from livedeform.fem_node.contact.contact import ProbeContact, make_contact
+from livedeform.fem_node.contact.self_contact import FacingParts
 from livedeform.fem_node.element.element import Space
 from livedeform.fem_node.items.continuum import Continuum
 from livedeform.fem_node.items.dynamics import Inertial, moves
@@ -90,7 +92,7 @@ class Mechanics:
             self.items.append(self.inertial)
         self.items += [Dead(space, load) for load in physics.loads]
         self.items += [RubbingLoad(space, load) for load in physics.loads if load.friction > 0.0]
-        self.items += make_supports(space, physics, unloaded)
+        self.items += make_supports(space, physics, self.continuum.modulus_behind, unloaded)
         self.items += [make_interface(space, i, physics.material.youngs_modulus) for i in physics.interfaces]
         self.contact: ProbeContact | None = None
         if physics.probe is not None:
@@ -149,13 +151,36 @@ class Mechanics:
         if self._failed is not None and self._is_hopeless(self._failed, moment):
             raise self._failed.error
         self.solver.begin()
+        before = self.solver.save()
         try:
             solution = self._from_any(moment, starts)
+            self._refuse_touching_itself(solution.x, moment, before)
         except ConvergenceError:
             self.solver.end(found=False)
             raise
         self.solver.end(found=True)
         return solution
+
+    @cached_property
+    def _facing(self) -> FacingParts | None:
+        """Return the parts of the body that may come to touch one another; an interface keeps two bodies apart."""
+        return None if self.physics.interfaces else FacingParts.of(self.space)
+
+    def _refuse_touching_itself(self, x: Array, moment: Moment, before: list[Any]) -> None:
+        """`ConvergenceError`, with the items as they were ``before``, for a solution that passes through itself."""
+        u = x[: 3 * self.space.n_nodes].reshape(-1, 3)
+        place = None if self._facing is None else self._facing.touching(self.space.nodes + u)
+        if place is None:
+            return
+        self.solver.restore(before)
+        at = ", ".join(f"{1e3 * c:.1f}" for c in place)
+        error = ConvergenceError(
+            f"a wrong equilibrium was found: the body touches itself at ({at}) mm, and passes through",
+            where="solver",
+            remedy="press less deep, or fill the gap in the surface: contact of the body with itself is not modelled",
+        )
+        self._failed = Failed(self.x.copy(), self.moment, moment, error)
+        raise error
 
     def _from_any(self, moment: Moment, starts: Iterable[Start] | None) -> Solution:
         """Solve from the first of ``starts`` that leads to ``moment``, and at last from the committed state."""

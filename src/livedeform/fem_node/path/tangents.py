@@ -173,11 +173,12 @@ class Neighbour:
         if _pulls(changed) != _pulls(reference):
             dead: list[Item] = [item for item in leader.items if isinstance(item, Dead)]
             self.replaced.append((dead, [Dead(leader.space, load) for load in changed.loads]))
-        self.gives = yielding_support(leader.space, reference, changed)
-        stiffer = changed.material.youngs_modulus != reference.material.youngs_modulus  # springs go by the modulus
+        body = self.continuum or leader.continuum
+        self.gives = yielding_support(leader.space, reference, changed, body.modulus_behind)
         self._sprung = _only_springs_change(reference, changed)
-        if (self.gives is None or self._sprung) and (reshaped or stiffer or changed.supports != reference.supports):
-            own = _springs_of(make_supports(leader.space, changed, unloaded))
+        another = self.continuum is not None or changed.supports != reference.supports  # springs go by the modulus
+        if (self.gives is None or self._sprung) and another:
+            own = _springs_of(make_supports(leader.space, changed, body.modulus_behind, unloaded))
             self.replaced.append((_springs_of(leader.items), own))
         before, now = memory_of(reference), memory_of(changed)
         probe, other = changed.probe, reference.probe

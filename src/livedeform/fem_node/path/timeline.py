@@ -42,7 +42,8 @@ class Timeline:
     """``start_ns``: of the recording, from which the release counts; ``clock_ns``: where the drifts' time is 0;
     ``dynamic``: steps are short enough for inertia (but only over the last while before a stamp); ``hung``: the body
     hung under its loads before it was held, and has not forgotten it; ``delays`` s after the release at which loads
-    begin to pull: a step of time ends there, as what it does in the middle of one is not known as exactly."""
+    begin to pull, of every physics that passes the same instants: a step of time ends there, as what it does in the
+    middle of one is not known as exactly."""
 
     start_ns: int
     clock_ns: int
@@ -57,28 +58,45 @@ class Timeline:
 
     @property
     def release_ns(self) -> int:
-        """The stamp from which weight and loads act."""
+        """The stamp at which the body is let go."""
         return self.start_ns + round(1e9 * self.release)
+
+    @property
+    def acts_from_ns(self) -> float:
+        """The stamp from which weight and loads act. A release of 0 means throughout (-inf): also at the moment, before
+        the recording's start, of a pose whose stamp is late."""
+        return -np.inf if self.release <= 0.0 else self.release_ns
+
+    def acts(self, stamp_ns: int) -> bool:
+        """Tell whether weight and loads act at a stamp."""
+        return stamp_ns >= self.acts_from_ns
+
+    @property
+    def _onsets(self) -> list[int]:
+        """The stamps, rising, at which loads begin to pull after the rest does."""
+        if self.release <= 0.0:
+            return []
+        return sorted({self.release_ns + round(1e9 * delay) for delay in self.delays if delay > 0.0})
 
     def instants(self, now_ns: int | None, stamp_ns: int, pace: Pace) -> Iterator[Instant]:
         """Yield what is passed from ``now_ns`` (None: from nothing) to ``stamp_ns``: each must be passed before the
         next is asked for. A stamp that goes back takes no time."""
         release_ns = self.release_ns
-        if self.hung and (now_ns is None or now_ns < release_ns):
+        if self.hung and (now_ns is None or not self.acts(now_ns)):
             now_ns = yield from self._held(now_ns, stamp_ns)
-            if stamp_ns < release_ns:
+            if not self.acts(stamp_ns):
                 return
         if now_ns is None:
             now_ns = min(self.start_ns, stamp_ns)
-            yield Instant(now_ns, np.inf, release_ns <= now_ns, with_probe=False)
+            yield Instant(now_ns, np.inf, self.acts(now_ns), with_probe=False)
             if self.dynamic:  # the probe may be there from the start: put in place without a blow
-                yield Instant(now_ns, 0.0, release_ns <= now_ns)
-        if now_ns < release_ns <= stamp_ns:
+                yield Instant(now_ns, 0.0, self.acts(now_ns))
+        if self.acts(stamp_ns) and not self.acts(now_ns):
             yield Instant(release_ns, 1e-9 * (release_ns - now_ns), active=False)  # it finds the body at rest
             if not self.dynamic:
                 yield Instant(release_ns, 0.0, active=True)
             now_ns = release_ns
-        yield from self._steps(now_ns, stamp_ns, pace, active=stamp_ns >= release_ns)
+        yield from self._steps(now_ns, stamp_ns, pace, active=self.acts(stamp_ns))
 
     def _held(self, now_ns: int | None, stamp_ns: int) -> Generator[Instant, None, int]:
         """Yield how the body rests, hangs, is lifted and held as it rested, to the release or the ``stamp_ns`` before;
@@ -91,25 +109,36 @@ class Timeline:
             yield Instant(now_ns, np.inf, active=False, with_probe=False, held=True)
         then_ns = min(stamp_ns, self.release_ns)
         yield Instant(then_ns, 1e-9 * max(then_ns - now_ns, 0), active=False, held=True)
-        if stamp_ns >= self.release_ns and not self.dynamic:
+        if self.acts(stamp_ns) and not self.dynamic:
             yield Instant(then_ns, 0.0, active=True)
         return then_ns
 
     def _steps(self, now_ns: int, stamp_ns: int, pace: Pace, *, active: bool) -> Iterator[Instant]:
         if not self.dynamic:
-            yield Instant(stamp_ns, 1e-9 * max(stamp_ns - now_ns, 0), active)
+            yield from self._at_rest(now_ns, stamp_ns, active=active)
             return
         follow_ns = stamp_ns - round(1e9 * MEMORY)
         if now_ns < follow_ns:
-            yield Instant(follow_ns, 1e-9 * (follow_ns - now_ns), active)
+            yield from self._at_rest(now_ns, follow_ns, active=active)
             now_ns = follow_ns
-        onsets = [self.release_ns + round(1e9 * delay) for delay in self.delays]
         while now_ns < stamp_ns:
-            ahead = [o for o in onsets if now_ns + CLOSE_NS < o < stamp_ns - CLOSE_NS]
+            ahead = [o for o in self._onsets if now_ns + CLOSE_NS < o < stamp_ns - CLOSE_NS]
             left = min(ahead, default=stamp_ns) - now_ns
             step = round(left / np.ceil(1e-9 * left / pace()))
             now_ns += step
             yield Instant(now_ns, 1e-9 * step, active, still=False)
+
+    def _at_rest(self, now_ns: int, stamp_ns: int, *, active: bool) -> Iterator[Instant]:
+        """Yield one step of a body without inertia to ``stamp_ns``, cut where loads begin to pull: they do so at once,
+        as at the release, while a step knows only what changes evenly from its beginning to its end."""
+        for onset in self._onsets:
+            if not now_ns <= onset <= stamp_ns:
+                continue
+            if now_ns < onset - 1:  # a nanosecond on either side: the delays themselves are not round
+                yield Instant(onset - 1, 1e-9 * (onset - 1 - now_ns), active)
+            now_ns = min(onset + 1, stamp_ns)
+            yield Instant(now_ns, 0.0, active)
+        yield Instant(stamp_ns, 1e-9 * max(stamp_ns - now_ns, 0), active)
 
     def in_path_steps(
         self,

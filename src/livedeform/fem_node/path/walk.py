@@ -111,7 +111,7 @@ class Walk:
         either. None if there is none, or if more than pose and loads decides."""
         if self.body.memory.reasons:
             return None
-        active = stamp_ns >= self.line.release_ns
+        active = self.line.acts(stamp_ns)
         pose, contact = self._pose(stamp_ns), self.body.contact
         for stamp, passed in self._passed.items():
             if passed.active != active:
@@ -185,6 +185,6 @@ class Walk:
         """Return what is to be known of the stamp that was just reached."""
         contact = self.body.contact
         touches = contact is not None and bool(contact.state.touches.any())
-        active = stamp_ns >= self.line.release_ns
+        active = self.line.acts(stamp_ns)
         saved = None if contact is None or touches else contact.save()
         return _Passed(self._pose(stamp_ns), active, None if touches else self.body.x, saved)

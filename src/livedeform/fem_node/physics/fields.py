@@ -3,7 +3,8 @@
 A field that depends on the body's shape has ``bind(body) -> field``; the model calls it once it knows the unloaded body
 (`fem_node.physics.record.bind_fields`). Fields jump over a distance no finite-element mesh resolves, so they are
 smoothed over ``BLUR`` (a thinner layer over its thickness): their integrals, and thereby the fit, then depend smoothly
-on the parameters. What ``jumps`` is averaged over parts of each element (`fem_node.element.subcells`).
+on the parameters. What ``jumps`` is averaged over parts of each element (`fem_node.element.subcells`); a skin may be
+much thinner than these, and is cut out of them.
 """
 
 from __future__ import annotations
@@ -12,10 +13,11 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
+from numpy.typing import NDArray
 
 from livedeform.common.types import Array
 from livedeform.fem_node.mesh.triangle_distance import TriangleTree, closest_features
-from livedeform.fem_node.physics.record import BodyShape, ModulusField
+from livedeform.fem_node.physics.record import BodyShape, ModulusField, Parts
 
 BLUR = 0.001  # m, half width of the ramp from inside to outside
 
@@ -107,15 +109,65 @@ class Skin(ModulusField):
     def __call__(self, X: Array, t: float) -> Array:
         if self.corners is None:
             raise ValueError("a skin needs the body's shape: bind it first")
-        depth = _known_depth(np.ascontiguousarray(X).tobytes(), self.corners.tobytes())
+        depth, _ = _depth(X, self.corners)
         return 1.0 + (self.ratio - 1.0) * inside_share(depth - self.thickness, min(BLUR, self.thickness))
+
+    def over(self, parts: Parts, t: float) -> Array:
+        """Return the mean factor (p,) over parts. The layer's inner face is taken for a plane in each; those of
+        elements that are near several faces of the body are split once more."""
+        if self.corners is None:
+            raise ValueError("a skin needs the body's shape: bind it first")
+        depth, inward = _depth(parts.middles, self.corners)
+        share = (depth < self.thickness).astype(float)
+        crossed = np.flatnonzero(np.abs(depth - self.thickness) < parts.reach)
+        corners, bent = parts.corners(crossed), _bent(inward, parts.n)[crossed]
+        depth, inward = depth[crossed], inward[crossed]
+        share[crossed] = _share_of_layer(corners, depth, inward, self.thickness)
+        pieces = parts.split(corners[bent]).reshape(-1, 4, 3)
+        of_pieces = _share_of_layer(pieces, *_depth(pieces.mean(axis=1), self.corners), self.thickness)
+        share[crossed[bent]] = of_pieces.reshape(-1, 8).mean(axis=1)
+        return 1.0 + (self.ratio - 1.0) * share
+
+
+def _share_of_layer(corners: Array, depth: Array, inward: Array, thickness: float) -> Array:
+    """Return the share (n,) of tetrahedra ``corners`` (n, 4, 3) m in a layer ``thickness`` m thick, of which the
+    middles are ``depth`` (n,) m deep and the unit vectors ``inward`` (n, 3) lead into the body."""
+    away = corners - corners.mean(axis=1)[:, None]
+    return share_below(depth[:, None] + (away @ inward[:, :, None])[..., 0], thickness)
+
+
+def share_below(values: Array, level: float) -> Array:
+    """Return the share (n,) of each tetrahedron's volume in which a linear function is below ``level``, by its
+    ``values`` (n, 4) at the corners (Bloechl et al. 1994, appendix B)."""
+    a, b, c, d = np.sort(values, axis=1).T
+    x = np.clip(level, a, d)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        low = (x - a) ** 3 / ((b - a) * (c - a) * (d - a))
+        bent = ((c - a) + (d - b)) / ((c - b) * (d - b)) * (x - b) ** 3
+        mid = ((b - a) ** 2 + 3.0 * (b - a) * (x - b) + 3.0 * (x - b) ** 2 - bent) / ((c - a) * (d - a))
+        high = 1.0 - (d - x) ** 3 / ((d - a) * (d - b) * (d - c))
+    share = np.select([level <= a, level >= d, x < b, x < c], [0.0, 1.0, low, mid], high)
+    return np.asarray(share)
+
+
+def _bent(inward: Array, n: int) -> NDArray[np.bool_]:
+    """Return which parts (p,) are of an element that has at least one, of ``n``, near another face than the others."""
+    straight = np.linalg.norm(inward.reshape(-1, n, 3).mean(axis=1), axis=1)
+    return np.repeat(straight < 1.0 - 0.5 / n, n)
+
+
+def _depth(points: Array, surface: Array) -> tuple[Array, Array]:
+    """Return how deep (n,) m below the triangles ``surface`` (k, 3, 3) m points are, and the unit vectors (n, 3) from
+    there inward."""
+    away = points - _known_nearest(np.ascontiguousarray(points).tobytes(), surface.tobytes())
+    depth = np.linalg.norm(away, axis=1)
+    return depth, away / np.maximum(depth, np.finfo(float).tiny)[:, None]
 
 
 @lru_cache(maxsize=8)
-def _known_depth(points: bytes, corners: bytes) -> Array:
-    """Return the distance (n,) m of ``points`` from the nearest of the triangles ``corners``, all by their arrays'
-    bytes: skins of any thickness are asked for the same places at every moment."""
+def _known_nearest(points: bytes, corners: bytes) -> Array:
+    """Return the place (n, 3) m on the triangles ``corners`` that is nearest to each of ``points``, all by their
+    arrays' bytes: skins of any thickness are asked for the same places again."""
     tree = TriangleTree.without_normals(np.frombuffer(corners).reshape(-1, 3, 3))
-    places = np.frombuffer(points).reshape(-1, 3)
-    nearest, _, _, _ = closest_features(tree, places)
-    return np.asarray(np.linalg.norm(places - nearest, axis=1))
+    nearest, _, _, _ = closest_features(tree, np.frombuffer(points).reshape(-1, 3))
+    return nearest

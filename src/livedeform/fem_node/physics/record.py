@@ -34,6 +34,28 @@ class BodyShape:
     held: NDArray[np.bool_]
 
 
+class Parts(Protocol):
+    """The small parts of all elements of the unloaded body, ``n`` of each, numbered (p,) element by element
+    (`fem_node.element.subcells`): their ``middles`` (p, 3) m, and how far (p,) m they ``reach`` from these."""
+
+    @property
+    def n(self) -> int: ...
+
+    @property
+    def middles(self) -> Array: ...
+
+    @property
+    def reach(self) -> Array: ...
+
+    def corners(self, which: NDArray[np.int64]) -> Array:
+        """Return the corners (n, 4, 3) m of some of them, by their numbers (n,)."""
+        ...
+
+    def split(self, parts: Array) -> Array:
+        """Return the corners (n, 8, 4, 3) m of the eight pieces of each of some parts, by their own (n, 4, 3) m."""
+        ...
+
+
 class ModulusField:
     """A factor of the modulus, as a function of the unloaded place and of time; a subclass writes ``__call__``."""
 
@@ -50,6 +72,10 @@ class ModulusField:
     def __call__(self, X: Array, t: float) -> Array:
         """Return the factor (q,) at unloaded positions ``X`` (q, 3) m and time ``t`` s on the drifts' clock."""
         raise NotImplementedError
+
+    def over(self, parts: Parts, t: float) -> Array:
+        """Return the mean factor (p,) over small parts of elements: of most fields that at their middles."""
+        return self(parts.middles, t)
 
     def bind(self, body: BodyShape) -> ModulusField:
         """Return the field for this unloaded body; most do not depend on its shape."""
@@ -69,6 +95,13 @@ class FrozenField(ModulusField):
 
     def __call__(self, X: Array, t: float) -> Array:
         return self.field(X, self.time)
+
+    @property
+    def jumps(self) -> bool:
+        return self.field.jumps
+
+    def over(self, parts: Parts, t: float) -> Array:
+        return self.field.over(parts, self.time)
 
     def bind(self, body: BodyShape) -> ModulusField:
         return replace(self, field=self.field.bind(body))
@@ -164,6 +197,11 @@ class PartialRegion(Protocol):
     @property
     def region(self) -> RegionTest:
         """The whole region."""
+        ...
+
+    def ramp(self, base: Array, width: float) -> float:
+        """Return over how many m the part may fade on a ``base`` (m, 3) m: ``width``, or what is left of it at its end;
+        0 of a part that is the whole."""
         ...
 
     def share(self, points: Array, base: Array, width: float) -> Array:

@@ -48,6 +48,7 @@ def load_evidence(run_dir: Path, experiment: Experiment) -> RunEvidence:
     metrics = replace(
         with_places(run_metrics(residuals, experiment.thresholds.error), residuals, experiment.markers),
         interpolation_bound=_known(document.get("interpolation_bound")),
+        interpolation_judged=_known(document.get("interpolation_judged")),
         coverage=read_coverage(document.get("coverage")),
         doubts=tuple(document.get("doubts", ())),
         wrong=tuple(document.get("wrong", ())),

@@ -19,6 +19,8 @@ from livedeform.stereo_node.detect.settings import DetectorSettings
 MARGIN_PX = (
     4.0  # around the outline; with 3 px the background's slope is less sure and the centre 10 % worse, 5 px cost time
 )
+TINY = 2.25  # px: the radius below which pictures do not tell a chord from a tilt
+CHORD = 3.0  # displacement of the centre of a disc that a chord cuts, per skewness of what is left
 MOST_SKEWED = 0.06  # of the radius: bodies stretch discs less unevenly; of one that is half covered it is 0.07 to 0.2
 
 
@@ -83,9 +85,12 @@ def fit_candidates(picture: Picture, start: Array, settings: DetectorSettings, n
             rejected[reason] = lost
         keep &= passed
     keep &= ~_twins(fit[:, :2], fit[:, 13] / np.maximum(np.abs(fit[:, 9]), 1e-9), radius, keep)
+    covariances = fit[keep][:, [10, 11, 11, 12]].reshape(-1, 2, 2)
+    if settings.centre != "moments":
+        covariances = covariances + _untold_cuts(shapes[keep], radius[keep], fit[keep, 17])
     return Blobs(
         centres=fit[keep, :2],
-        covariances=fit[keep][:, [10, 11, 11, 12]].reshape(-1, 2, 2),
+        covariances=covariances,
         shapes=shapes[keep],
         contrasts=fit[keep, 9],
         blur_px=fit[keep, 5],
@@ -116,6 +121,17 @@ def _tests(
         "blurred away": fit[:, 5] < np.maximum(radius, 1.0),
         "uncertain centre": (fit[:, 10] + fit[:, 12] < 2 * settings.max_sigma**2) & (fit[:, 10] > 0) & (fit[:, 12] > 0),
     }
+
+
+def _untold_cuts(shapes: Array, radius: Array, skewness: Array) -> Array:
+    """Return (n, 2, 2) px2: where the middles of tiny discs may be if something as light as the ground cuts them.
+
+    What is left is an ellipse, as of a disc that is tilted: its middle may lie off by as much as its half axes differ,
+    and by more where its ``skewness`` (n,) px shows.
+    """
+    axes = 1 / np.maximum(np.linalg.eigvalsh(shapes), 1e-6)
+    variance = (axes[:, 0] - axes[:, 1]) ** 2 + (CHORD * skewness) ** 2
+    return np.asarray(np.where(radius < TINY, variance, 0.0)[:, None, None] * np.eye(2))
 
 
 def _twins(centres: Array, badness: Array, radius: Array, keep: NDArray[np.bool_]) -> NDArray[np.bool_]:

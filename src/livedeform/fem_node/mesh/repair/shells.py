@@ -99,6 +99,17 @@ def turned_outward(v: Array, t: IntArray, where: str, repairs: list[Repair]) -> 
     return np.concatenate([s[:, ::-1] if k in inside_out else s for k, s in enumerate(shells)]) if inside_out else t
 
 
+def outermost(v: Array, t: IntArray) -> IntArray:
+    """Return the triangles (k, 3) of the outermost shells of a closed surface (vertices (n, 3) m), turned to look
+    outward: of a rigid body nothing that lies within is ever touched."""
+    t = turned_alike(v, t, [])
+    labels = _pieces(v, t)
+    shells = [t[labels == piece] for piece in np.unique(labels)]
+    volumes = np.array([enclosed_volume(v, shell) for shell in shells])
+    outer = [k for k in range(len(shells)) if not _around(v, shells, volumes, k)]
+    return np.concatenate([shells[k] if volumes[k] > 0.0 else shells[k][:, ::-1] for k in outer])
+
+
 def _cavity(v: Array, shell: IntArray, volume: float, of_body: float, where: str) -> Repair:
     """Name a shell within a body as the cavity that it is; ``volume`` and ``of_body``: signed, m3, as they look."""
     place = ", ".join(f"{c:.1f}" for c in np.round(1e3 * v[shell].mean(axis=(0, 1)), 1) + 0.0)  # + 0.0: no -0.0
