@@ -83,6 +83,7 @@ class NoiseSettings:
     sample_outlier: float = _effort(3.5, "sigma", "beyond which a difference does not count for the covariance")
     most_trusted: float = _effort(10.0, "1", "usual frames that one may stand for, however small a sigma it states")
     quiet: float = _effort(0.67, "1", "share of the time, the slowest, in which second differences are noise")
+    changed: float = _effort(0.9, "1", "of the points that are other ones than before where a tracker measured anew")
     even: float = _effort(0.3, "1", "of the frame interval by which evenly sampled frames may differ")
     enough: int = _effort(30, "1", "differences that tell the scale of the noise")
     least_frames: int = _effort(5, "1", "frames that have differences worth a median")

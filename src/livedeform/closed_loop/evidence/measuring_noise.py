@@ -158,8 +158,9 @@ def _changing_lag(data: Track, settings: NoiseSettings) -> int:
     y, step = data.points, np.diff(data.stamps_ns)
     most = int(1e9 * settings.window / np.median(step)) if len(step) else 1
     for lag in range(1, min(most, len(y) // settings.least_frames) + 1):
-        d = (y[lag:] - y[:-lag])[np.isfinite(y[lag:] - y[:-lag]).all(axis=2)]
-        if len(d) and (d != 0.0).any(axis=1).mean() > 0.9:
+        d = y[lag:] - y[:-lag]
+        d = d[np.isfinite(d).all(axis=2)]
+        if len(d) and (d != 0.0).any(axis=1).mean() > settings.changed:
             return lag
     return 1
 

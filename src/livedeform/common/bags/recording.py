@@ -104,6 +104,11 @@ class Recording:
     force_doubts: list[str] = field(default_factory=list)
 
     @property
+    def measured_frames(self) -> list[MarkerFrame]:
+        """Return the measured frames, as they were before any correction."""
+        return self.uncorrected_marker_frames or self.marker_frames
+
+    @property
     def own_name(self) -> str:
         """Return its name by which the experiment declares what acts in it (`recording_name`); a run's is that of the
         recording that was run."""

@@ -123,7 +123,7 @@ def _as_deep_as_later(probe: ProbeRecord, path: ProbeApproach) -> bool:
 def _markers_stayed(probe: ProbeRecord, path: ProbeApproach) -> bool:
     """Tell whether the markers are where they began when the probe is farthest away, while they move later: then it did
     not press them at first."""
-    frames = probe.recording.uncorrected_marker_frames or probe.recording.marker_frames
+    frames = probe.recording.measured_frames
     moved, _ = without_noise(lasting(motion(frames)), np.nan)
     if not moved.any():
         return False
@@ -135,7 +135,7 @@ def _markers_stayed(probe: ProbeRecord, path: ProbeApproach) -> bool:
 def _presses(recording: Recording, path: ProbeApproach, limit: float) -> list[tuple[float, float]]:
     """Return when (s) each press begins and ends by the markers, while the probe is deeper than ``limit`` m; none where
     there are no markers yet."""
-    frames = recording.uncorrected_marker_frames or recording.marker_frames
+    frames = recording.measured_frames
     moved = motion(frames)
     if not np.isfinite(moved).any():
         return []

@@ -59,7 +59,7 @@ class MarkerTrack:
     """The markers of a recording: ``seconds`` (n,) and ``points`` (n, m, 3) m, NaN where one was not seen."""
 
     def __init__(self, recording: Recording) -> None:
-        frames = [f for f in recording.uncorrected_marker_frames or recording.marker_frames if len(f.ids)]
+        frames = [f for f in recording.measured_frames if len(f.ids)]
         self.frames = frames
         self.ids = np.unique(np.concatenate([f.ids for f in frames])) if frames else np.zeros(0, int)
         self.seconds = np.array([(f.stamp_ns - recording.start_ns) * 1e-9 for f in frames])

@@ -59,15 +59,10 @@ def check_named(recording: Recording, experiment: Experiment) -> list[Finding]:
     return [Finding("WARN", text, "correct the line's name, if one is meant for it")]
 
 
-def frames_of(recording: Recording) -> list[MarkerFrame]:
-    """The measured frames, as they were before any correction."""
-    return recording.uncorrected_marker_frames or recording.marker_frames
-
-
 def check_inputs(recording: Recording, experiment: Experiment, body: Surface) -> list[Finding]:
     """Check whether what the experiment needs was recorded."""
     found = []
-    frames = frames_of(recording)
+    frames = recording.measured_frames
     if frames and not any(len(frame.ids) for frame in frames):
         text = f"no frame of {t.STEREO_MARKERS} holds a marker of the experiment with finite coordinates"
         found.append(Finding("ERROR", text, "check the tracker, and the ids in markers.csv"))
@@ -128,7 +123,7 @@ def other_frame(topic: str, frame: str) -> Finding:
 
 def check_stamps(recording: Recording, experiment: Experiment, body: Surface) -> list[Finding]:
     """Check whether the poses cover the measured moments."""
-    stamps = np.array([frame.stamp_ns for frame in frames_of(recording)] or recording.picture_stamps_ns)
+    stamps = np.array([frame.stamp_ns for frame in recording.measured_frames] or recording.picture_stamps_ns)
     if not len(stamps) or not recording.poses or experiment.probe is None:
         return []
     first, last = recording.poses[0].stamp_ns, recording.poses[-1].stamp_ns
@@ -144,7 +139,7 @@ def check_stamps(recording: Recording, experiment: Experiment, body: Surface) ->
 
 def check_gaps(recording: Recording, experiment: Experiment, body: Surface) -> list[Finding]:
     """Check whether measured moments lie between poses that nobody interpolates."""
-    stamps = np.array([frame.stamp_ns for frame in frames_of(recording)] or recording.picture_stamps_ns)
+    stamps = np.array([frame.stamp_ns for frame in recording.measured_frames] or recording.picture_stamps_ns)
     poses = np.sort([pose.stamp_ns for pose in recording.poses])
     if not len(stamps) or len(poses) < 2 or experiment.probe is None:
         return []
@@ -163,7 +158,7 @@ def check_gaps(recording: Recording, experiment: Experiment, body: Surface) -> l
 
 def check_ids(recording: Recording, experiment: Experiment, body: Surface) -> list[Finding]:
     """Markers that the experiment does not know, and those that are never seen."""
-    frames = frames_of(recording)
+    frames = recording.measured_frames
     if not frames:
         return []
     seen = set(np.concatenate([frame.ids for frame in frames]).tolist()) | set(recording.unknown_ids)
@@ -181,7 +176,7 @@ def check_ids(recording: Recording, experiment: Experiment, body: Surface) -> li
 
 def check_places(recording: Recording, experiment: Experiment, body: Surface) -> list[Finding]:
     """Check whether the markers are where the experiment has them, as far as half of the body's size."""
-    away = _away(frames_of(recording), experiment)
+    away = _away(recording.measured_frames, experiment)
     away = away[np.isfinite(away)]
     if not len(away):
         return []
@@ -198,7 +193,7 @@ def check_places(recording: Recording, experiment: Experiment, body: Surface) ->
 
 def check_exchanges(recording: Recording, experiment: Experiment, body: Surface) -> list[Finding]:
     """Check whether the markers keep their ids."""
-    return check_exchanged(frames_of(recording), recording.start_ns)
+    return check_exchanged(recording.measured_frames, recording.start_ns)
 
 
 def _away(frames: Sequence[MarkerFrame], experiment: Experiment) -> Array:
@@ -250,7 +245,7 @@ def load_checked(fit: Sequence[Path], test: Sequence[Path], experiment: Experime
     clock = {"clock_start_ns": drifts_clock_ns(experiment, recordings[: len(fit)])}
     experiment = experiment.model_copy(update={"timeline": experiment.timeline.model_copy(update=clock)})
     for path, recording in zip(paths, recordings, strict=True):
-        if not frames_of(recording) and not recording.picture_stamps_ns:
+        if not recording.measured_frames and not recording.picture_stamps_ns:
             raise InputError(
                 f"holds neither {t.STEREO_MARKERS} nor pictures: points without ids say how far surfaces are apart, "
                 "and not which point went where",
@@ -290,9 +285,10 @@ def refuse_overlap(fit: Sequence[tuple[Path, Recording]], test: Sequence[tuple[P
 
 def _shared(a: Recording, b: Recording) -> bool:
     """Return whether measured frames, or, where one has none, most poses of the shorter one, are in both."""
-    if frames_of(a) and frames_of(b):
+    if a.measured_frames and b.measured_frames:
         keys = [
-            {(f.stamp_ns, f.points.astype(np.float32).tobytes()) for f in frames_of(r) if len(f.ids)} for r in (a, b)
+            {(f.stamp_ns, f.points.astype(np.float32).tobytes()) for f in r.measured_frames if len(f.ids)}
+            for r in (a, b)
         ]
         return bool(keys[0] & keys[1])
     poses = [{(p.stamp_ns, p.position.tobytes()) for p in r.poses} for r in (a, b)]

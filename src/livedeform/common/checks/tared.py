@@ -131,7 +131,7 @@ def _markers_rest(
 ) -> bool:
     """Tell whether the markers, where there are some, are still while the probe is at the rows ``near`` and ``passed``
     of its ``depth`` (n,) m, beside how they move when it presses."""
-    frames = recording.uncorrected_marker_frames or recording.marker_frames
+    frames = recording.measured_frames
     moved = motion(frames)
     known = np.isfinite(moved)
     if not known.any():

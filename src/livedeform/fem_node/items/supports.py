@@ -275,12 +275,12 @@ class Springs(PlainItem):
         self._normals = normals[:, :, None] * normals[:, None, :]
         self._dofs = node_dofs(facets)
         self._slack = np.zeros(self._dofs.shape)
-        self._facets, self._law, self._behind = face.facets, law, behind
+        self._numbers, self._law, self._behind = face.facets, law, behind
         self._modulus, self._blocks = np.zeros(0), np.zeros((0, 0, 0))
 
     def prepare(self, moment: Moment) -> None:
         """Take the stiffness that the body behind has now."""
-        modulus = self._behind(self._facets)
+        modulus = self._behind(self._numbers)
         if np.array_equal(modulus, self._modulus):
             return
         normal, tangential = self._law(modulus[:, None])

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from livedeform.common.experiment.constants import shear_modulus_of
 from livedeform.common.types import Array
 from livedeform.fem_node.element.simd import side_by_side
 from livedeform.fem_node.materials.base import Material
@@ -24,7 +23,7 @@ def make(spec: MaterialSpec) -> Material:
     2)."""
     alpha = np.atleast_1d(np.asarray(spec.extra.get("alpha", [2.0]), float))
     weights = np.atleast_1d(np.asarray(spec.extra.get("mu", np.ones(len(alpha))), float))
-    mu = spec.shear_modulus * weights / (shear_modulus_of(spec.model, {"mu": weights}) or 1.0)
+    mu = spec.shear_modulus * weights / weights.sum()
 
     def response(F: Array, factor: Array, psi: Array, P: Array, A: Array | None) -> None:
         _response(F, factor, mu, alpha, psi, P, A)

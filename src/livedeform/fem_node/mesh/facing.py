@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from livedeform.common.compiled import njit
 from livedeform.common.types import Array
+from livedeform.fem_node.mesh.triangle_distance import dot
 
 ALONG = 1e-6  # cosine; a triangle that is seen that much from the side is not looked at
 FLAT = 1e-9  # of the surface's size; what is less in front of a triangle lies in its plane
@@ -63,10 +64,10 @@ def _look(corners: Array, normals: Array, seen: NDArray[np.bool_]) -> None:
                 from_a[axis] = middle[axis] - corners[j, 0, axis]
             _cross(direction, ac, p)
             _cross(from_a, ab, q)
-            determinant = _dot(ab, p)
+            determinant = dot(ab, p)
             if determinant == 0.0:
                 continue
-            u, w = _dot(from_a, p) / determinant, _dot(direction, q) / determinant
+            u, w = dot(from_a, p) / determinant, dot(direction, q) / determinant
             if u >= 0.0 and w >= 0.0 and u + w <= 1.0:
                 nearest, met = height / against, j
         if met >= 0:
@@ -78,9 +79,3 @@ def _cross(a: Array, b: Array, out: Array) -> None:
     out[0] = a[1] * b[2] - a[2] * b[1]
     out[1] = a[2] * b[0] - a[0] * b[2]
     out[2] = a[0] * b[1] - a[1] * b[0]
-
-
-@njit(cache=True)
-def _dot(a: Array, b: Array) -> float:
-    product: float = a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-    return product

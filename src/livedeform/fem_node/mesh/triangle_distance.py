@@ -128,7 +128,7 @@ def _box_distance2(p, low, high):
 
 
 @njit(cache=True)
-def _dot(u, v):
+def dot(u, v):
     return u[0] * v[0] + u[1] * v[1] + u[2] * v[2]
 
 
@@ -147,18 +147,18 @@ def closest_on_triangle(p, a, b, c):
     """Nearest point of triangle abc, as numbers, and its feature: 0 face, 1-3 edges, 4-6 vertices (Ericson 2005,
     5.1.5)."""
     ab, ac, ap = _less(b, a), _less(c, a), _less(p, a)
-    d1, d2 = _dot(ab, ap), _dot(ac, ap)
+    d1, d2 = dot(ab, ap), dot(ac, ap)
     if d1 <= 0.0 and d2 <= 0.0:
         return (a[0], a[1], a[2]), 4
     bp = _less(p, b)
-    d3, d4 = _dot(ab, bp), _dot(ac, bp)
+    d3, d4 = dot(ab, bp), dot(ac, bp)
     if d3 >= 0.0 and d4 <= d3:
         return (b[0], b[1], b[2]), 5
     vc = d1 * d4 - d3 * d2
     if vc <= 0.0 and d1 >= 0.0 and d3 <= 0.0:
         return _along(a, d1 / (d1 - d3), ab), 1
     cp = _less(p, c)
-    d5, d6 = _dot(ab, cp), _dot(ac, cp)
+    d5, d6 = dot(ab, cp), dot(ac, cp)
     if d6 >= 0.0 and d5 <= d6:
         return (c[0], c[1], c[2]), 6
     vb = d5 * d2 - d1 * d6
@@ -193,7 +193,7 @@ def _closest(points, corners, normals, low, high, child, first, last):
                 for t in range(first[node], last[node]):
                     q, feature = closest_on_triangle(p, corners[t, 0], corners[t, 1], corners[t, 2])
                     gap = _less(p, q)
-                    distance2 = _dot(gap, gap)
+                    distance2 = dot(gap, gap)
                     if distance2 < best:
                         best = distance2
                         nearest[i] = q

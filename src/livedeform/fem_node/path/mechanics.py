@@ -151,7 +151,7 @@ class Mechanics:
         if self._failed is not None and self._is_hopeless(self._failed, moment):
             raise self._failed.error
         self.solver.begin()
-        before = self.solver.save()
+        before = self.solver.save() if self._facing is not None else []
         try:
             solution = self._from_any(moment, starts)
             self._refuse_touching_itself(solution.x, moment, before)
