@@ -98,7 +98,7 @@ def test_a_failed_frame_does_not_poison_the_next(space, monkeypatch):
 
 
 def _fail(self, *arguments):
-    raise solver_module.Lost("made to fail")
+    raise solver_module.Lost("made to fail", 0)
 
 
 def test_an_impossible_weight_is_a_convergence_error_with_a_remedy():

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from livedeform.fem_node.solve.newton import Learned, Newton
+from livedeform.fem_node.solve.newton import Learned, Lost, Newton
 
 SHORT = 1e-5  # m, over which the energy below is a parabola; further out it is a cone, and a full step is too far
 
@@ -45,3 +45,19 @@ def test_a_rough_search_ends_at_an_equilibrium_as_an_exact_one_does():
         energy = bowl.evaluate(start, bowl, tangent=True)
         found = Newton(bowl, start, energy, tolerance, 0.5).run(80)
         assert np.abs(found).max() < tolerance
+
+
+def test_a_step_on_trial_that_leads_to_where_there_is_no_factor_is_taken_back():
+    """It may have crushed elements, whose tangent is indefinite whatever is left out of it: the moment was lost."""
+    refused = []
+
+    class Cliff(Bowl):
+        def factorise(self, x):
+            if np.abs(x).max() > 4.0 * SHORT:
+                refused.append(x)
+                raise Lost("no factor")
+            super().factorise(x)
+
+    cliff, start = Cliff(), np.array([2.0 * SHORT, -1.5 * SHORT])
+    found = Newton(cliff, start, cliff.evaluate(start, cliff, tangent=True), 1e-8, 0.5).run(80)
+    assert refused and np.abs(found).max() < 1e-8

@@ -10,6 +10,7 @@ import pytest
 from bodies import plane, soft
 
 import livedeform.fem_node.contact.contact
+import livedeform.fem_node.items.friction
 from livedeform.common.types import Pose
 from livedeform.fem_node.contact.probe_shapes import Box
 from livedeform.fem_node.element.element import make_space
@@ -29,6 +30,7 @@ SIZE = 0.04
 def exact(monkeypatch):
     """A solver and a contact without visible tolerances: finite differences of whole runs need them."""
     monkeypatch.setattr(livedeform.fem_node.contact.contact, "MAX_OUTER", 300)
+    monkeypatch.setattr(livedeform.fem_node.items.friction, "SETTLED", 1e-11)
     return SolverSettings(tolerance=1e-13, gap_tolerance=1e-13, max_updates=300)
 
 
@@ -55,6 +57,9 @@ def _changed(physics, name, h):
         "mu": lambda: physics.with_probe(friction=probe.friction + h),
         "offset": lambda: physics.with_probe(offset=probe.offset + 0.01 * h * np.array([1.0, 0.0, 1.0])),
         "late": lambda: physics.with_probe(time_offset=h),
+        "slip": lambda: replace(
+            physics, supports=(replace(physics.supports[0], mu=physics.supports[0].mu + h), *physics.supports[1:])
+        ),
         "spring": lambda: replace(physics, supports=(replace(physics.supports[0], stiffness=1e6 * (1 + h)),)),
     }
     return changes[name]()
@@ -155,3 +160,100 @@ def test_friction(space, exact):
     poses = [Pose(k * 100_000_000, np.array([0.001 + 2e-4 * k, 0.0, 0.0295 - 5e-4 * k]), DOWN) for k in range(5)]
     _check(space, physics, ["E", "nu", "tilt"], poses, stamps, exact, H=1e-4)  # E and nu: 1.4e-6
     _check(space, physics, ["mu"], poses, stamps, exact, h=1e-5, bound=1.5e-5)  # 9.4e-6
+
+
+def _on_friction(mu, gravity=(2.0, 0.0, -9.81), *others, **changes):
+    """The body on a support with friction, which it is pulled along."""
+    supports = (Support(plane(2, 0.0), "friction", mu=mu), *others)
+    return replace(_physics(**changes), supports=supports, gravity=np.array(gravity))
+
+
+SIDE = Support(plane(0, -SIZE / 2), "spring", stiffness=1e4)
+ROUGH = WalkSettings(corrections=1)
+
+
+SLIPPING = [
+    (_on_friction(2.0), ["E", "density", "tilt", "slip"], [0]),  # nearly all sticks
+    (_on_friction(0.5), ["E", "nu", "density"], [0]),  # a part slips
+    (_on_friction(0.3, (2.0, 0.7, -9.81)), ["E", "nu", "tilt", "slip"], [0]),
+    (_on_friction(0.1, (3.0, 0.5, -9.81), SIDE), ["E", "density", "tilt", "slip"], [0]),  # all, along side springs
+    (_on_friction(0.4, scan_fraction=1.0), ["E", "tilt", "scan"], [0]),
+    (  # slips on as it creeps
+        _on_friction(0.5, prony=Prony((0.3,), (0.5,)), release=0.1),
+        ["g", "tau", "E", "tilt", "slip"],
+        [0, 100_000_000, 300_000_000],
+    ),
+]
+
+
+@pytest.mark.parametrize(
+    ("physics", "names", "stamps"),
+    [(_on_friction(0.5), ["tilt", "slip"], [0]), *(pytest.param(*case, marks=pytest.mark.slow) for case in SLIPPING)],
+)
+def test_a_support_that_slips(space, exact, physics, names, stamps):
+    """Limits follow the pressure, and each body slips on a path of its own; what has slipped is at its limit. Measured:
+    2.6e-6, of Poisson's ratio 1.4e-5: h times the curvature."""
+    exact = replace(exact, max_updates=3000)
+    _check(space, physics, names, None, stamps, exact, bound=2e-5, H=1e-4, walk_settings=ROUGH)
+
+
+@pytest.mark.slow
+def test_friction_with_the_support_changes_the_unloaded_shape(space, exact):
+    """A change of friction alone moves nothing before its limits are taken: the shape stayed as it was, and the
+    derivative was off by more than all of it. Measured 2.3e-5, as the inverse problem is solved."""
+    exact = replace(exact, max_updates=3000)
+    physics = _on_friction(0.4, scan_fraction=1.0)
+    _check(space, physics, ["slip"], None, [0], exact, bound=1e-4, H=4e-5, walk_settings=ROUGH)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("friction", "names"), [(0.0, ["E", "tilt", "slip", "offset"]), (0.3, ["E", "slip", "mu"])])
+def test_a_support_that_slips_under_a_probe(space, exact, friction, names):
+    """As exact as on a support that holds: the springs of the contact give, by up to 0.5 % of the force."""
+    exact = replace(exact, max_updates=3000)
+    physics = _on_friction(0.4, probe=Probe(Box(0.02, 0.012, 0.02, 0.002), friction=friction))
+    stamps = [0, 200_000_000, 400_000_000]
+    poses = [Pose(k * 100_000_000, np.array([0.004 + 5e-4 * k, 0.0, 0.0296 - 4e-4 * k]), DOWN) for k in range(5)]
+    _check(space, physics, names, poses, stamps, exact, bound=1e-2, H=2e-5, walk_settings=ROUGH)
+
+
+@pytest.mark.slow
+def test_a_support_that_slips_in_full(space, exact):
+    """Whole changed bodies follow with the same factor: from a tangent without the limits they settled nowhere, and
+    were all solved for themselves. Measured 6.8e-6."""
+    exact = replace(exact, max_updates=3000, gap_tolerance=1e-14)
+    physics = _on_friction(0.4, probe=Probe(Box(0.02, 0.012, 0.02, 0.002)))
+    stamps = [0, 200_000_000, 400_000_000]
+    poses = [Pose(k * 100_000_000, np.array([0.008 + 3e-4 * k, 0.0, 0.0296 - 4e-4 * k]), DOWN) for k in range(5)]
+    _check(space, physics, ["E", "tilt", "slip", "offset"], poses, stamps, exact, bound=2e-5, H=4e-5)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("changes", "stamps"),
+    [
+        ({}, [0]),
+        ({"prony": Prony((0.5,), (0.3,)), "release": 0.05}, [100_000_000, 300_000_000, 900_000_000]),
+        ({"scan_fraction": 1.0}, [0]),
+        ({"scan_fraction": 0.5}, [0]),
+    ],
+)
+def test_a_bond_that_begins_to_give_way(space, exact, changes, stamps):
+    """Springs instead of the bond, by their compliance. It gives from where they are slack: of a loaded scan the
+    derivative was off by half. And what it gave has faded: off by 2 % after two relaxation times. Measured: 1.8 % of
+    a loaded scan, 0.2 % of the others."""
+    supports, k = (Support(plane(2, 0.0)),), 1e8
+    physics = replace(_physics(**changes), supports=supports, gravity=np.array([3.0, 0.0, -9.81]))
+
+    def markers(stiffness):
+        sprung = (Support(plane(2, 0.0), "spring", stiffness=stiffness),) if stiffness else supports
+        model = PhantomModel(space, replace(physics, supports=sprung), markers=MARKERS, settings=exact)
+        return np.array([p.markers for p in model.simulate(None, stamps, start_ns=0).predictions])
+
+    far, near = (n * k * (markers(n * k) - markers(None)) for n in (1.0, 2.0))
+    full = 2.0 * near - far
+    sprung = replace(physics, supports=(Support(plane(2, 0.0), "spring", stiffness=k),))
+    model = PhantomModel(space, physics, markers=MARKERS, settings=exact)
+    found = model.simulate(None, stamps, [Direction("k", sprung, 1.0 / k)], start_ns=0, walk_settings=ROUGH)
+    off = np.abs(found.d_markers[..., 0] - full).max(axis=(1, 2)) / np.abs(full).max(axis=(1, 2))
+    assert off.max() < (0.03 if "scan_fraction" in changes else 0.005)

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from bodies import block_space, moment, plane, soft, solve, symmetry
+from bodies import EXACT, block_space, moment, plane, soft, solve, symmetry
 
 from livedeform.fem_node.effects import base_debonding
 from livedeform.fem_node.element.element import make_space
@@ -103,6 +103,16 @@ def test_friction_holds_up_to_mu_times_the_pressure(mu, sticks):
         assert np.abs(mechanics.u).max() < 1e-3
     else:
         assert abs(force[0]) <= mu * weight * 1.001
+
+
+def test_a_body_that_rested_without_weight_is_held_by_friction_once_it_acts():
+    """Without pressure at rest friction bore nothing there, and nothing held the body as its weight began to act."""
+    physics = replace(soft(0.49, 4e3), supports=(Support(plane(2, 0.0), "friction", mu=0.5),))
+    weight = [2.0, 0.0, -9.81]
+    rested = Mechanics(block_space(), physics, settings=EXACT)
+    rested.advance(moment(load=0.0))
+    rested.advance(moment(weight))
+    np.testing.assert_allclose(rested.u, solve(block_space(), physics, weight).u, atol=1e-9)
 
 
 def test_a_sphere_held_along_its_normals_keeps_its_surface():

@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from livedeform.common.frames import slerp
 from livedeform.common.types import Array
-from livedeform.fem_node.solve.assembly import Pattern, System
+from livedeform.fem_node.solve.assembly import Feedback, Pattern, System
 
 SLIGHT = 1e-6  # of a step: round-off of stamps
 RETREAT = 0.05  # m along the probe's axis, from where it comes if it was not there before
@@ -132,6 +132,11 @@ class Item(Protocol):
     def stiffen(self, x: Array) -> None:
         """Make constraints that multipliers hold at the solution ``x`` respond as constraints (for sensitivities)."""
 
+    def feedback(self, x: Array) -> Feedback | None:
+        """Return what the tangent at the solution ``x`` leaves out, for sensitivities: forces that follow the unknowns
+        from one outer iteration to the next. None: nothing."""
+        ...
+
     def follow(self, other: Any) -> None:
         """Take over the iteration state (multipliers), not the history, of the same item of a slightly different body
         that has just been solved at this moment."""
@@ -214,6 +219,10 @@ class PlainItem:
 
     def stiffen(self, x: Array) -> None:
         """Do nothing: there are no multipliers."""
+
+    def feedback(self, x: Array) -> Feedback | None:
+        """Return None: the tangent is whole."""
+        return None
 
     def follow(self, other: Any) -> None:
         """Do nothing: there is no iteration state."""

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +23,7 @@ from trimesh.remesh import subdivide_to_size
 from livedeform.common.errors import InputError
 from livedeform.common.types import Array
 from livedeform.fem_node.element.element import Space
+from livedeform.fem_node.items.friction import FrictionSupport
 from livedeform.fem_node.items.loads import facets_in
 from livedeform.fem_node.items.protocol import Item, Moment, PlainItem
 from livedeform.fem_node.physics.record import PartialRegion, Physics, Support
@@ -307,87 +308,3 @@ class Springs(PlainItem):
         if tangent:
             system.add_blocks(self._positions, self._blocks)
         return 0.5 * float(np.sum(u * force))
-
-
-class FrictionSupport(PlainItem):
-    """Held along the normal by stiff springs; along the surface by Coulomb friction with elastic sticking.
-
-    At each quadrature point the traction is t = k_t (g - g_slip), limited to mu p; p is the pressure of the last outer
-    iteration, so that each Newton solution has an energy (Tresca friction), and slip is committed with the step
-    (Wriggers 2006, sec. 5.2 and 6.3).
-    """
-
-    def __init__(self, space: Space, face: Face, law: Law, mu: float, behind: Behind) -> None:
-        facets = space.facets[face.facets]
-        self._values, self._weights, normals = space.facet_rule(2, facets)
-        if face.normal is not None:
-            normals = np.broadcast_to(face.normal, normals.shape)
-        self._normals = np.repeat(normals, len(self._values), axis=0).reshape(len(facets), -1, 3)
-        self._mu, self._law, self._behind, self._numbers = mu, law, behind, face.facets
-        self._facets, self._dofs = facets, node_dofs(facets)
-        self._limit = np.full(self._weights.shape, np.inf)  # mu p, Pa; it sticks until the pressure is known
-        self._slip = np.zeros((*self._weights.shape, 3))
-        self._slack = np.zeros(self._dofs.shape)
-
-    def prepare(self, moment: Moment) -> None:
-        """Take the stiffness (f, 1) Pa/m, along the normal and while it sticks, that the body behind has now."""
-        modulus = self._behind(self._numbers)[:, None]
-        self._k_n, self._k_t = (np.broadcast_to(k, modulus.shape) for k in self._law(modulus))
-
-    def set_unloaded(self, unloaded: Array | None) -> None:
-        """Take where nothing has slipped: displacement (n, 3) m from the scanned shape, None: the scanned shape
-        itself."""
-        self._slack = np.zeros(self._dofs.shape) if unloaded is None else unloaded.ravel()[self._dofs]
-
-    def attach(self, pattern: Pattern) -> None:
-        self._positions = pattern.positions(self._dofs)
-
-    def _gaps(self, x: Array) -> tuple[Array, Array, Array]:
-        v = (x[self._dofs] - self._slack).reshape(len(self._facets), -1, 3)
-        u = np.einsum("qa,kai->kqi", self._values, v)
-        normal = np.einsum("kqi,kqi->kq", u, self._normals)
-        tangential = u - normal[..., None] * self._normals - self._slip
-        return normal, tangential, np.linalg.norm(tangential, axis=2)
-
-    def evaluate(self, x: Array, system: System, *, tangent: bool) -> float:
-        normal, gap, length = self._gaps(x)
-        trial = self._k_t * length
-        slips = trial > self._limit
-        limit = np.where(slips, self._limit, 0.0)
-        secant = np.where(slips, limit / np.maximum(length, 1e-300), self._k_t)
-        traction = (self._k_n * normal)[..., None] * self._normals + secant[..., None] * gap
-        system.add_vectors(
-            self._dofs, np.einsum("kq,qa,kqi->kai", self._weights, self._values, traction).reshape(len(self._dofs), -1)
-        )
-        if tangent:
-            nn = self._normals[..., :, None] * self._normals[..., None, :]
-            D = self._k_n[..., None, None] * nn + secant[..., None, None] * (np.eye(3) - nn)
-            d = gap / np.maximum(length, 1e-300)[..., None]
-            D -= np.where(slips, secant, 0.0)[..., None, None] * d[..., :, None] * d[..., None, :]
-            n = self._dofs.shape[1]
-            blocks = np.einsum("kq,qa,qb,kqij->kaibj", self._weights, self._values, self._values, D)
-            system.add_blocks(self._positions, blocks.reshape(-1, n, n))
-        sliding = limit * length - 0.5 * limit**2 / self._k_t
-        energy = 0.5 * self._k_n * normal**2 + np.where(slips, sliding, 0.5 * self._k_t * length**2)
-        return float(np.sum(self._weights * energy))
-
-    def update(self, x: Array) -> bool:
-        normal, _, _ = self._gaps(x)
-        limit = self._mu * np.maximum(
-            self._k_n * normal, 0.0
-        )  # outward motion is held back: pressed against the support
-        scale = max(float(np.abs(limit).max()), 1e-12)
-        changed = not np.allclose(limit, self._limit, rtol=0.0, atol=1e-4 * scale)
-        self._limit = limit
-        return changed
-
-    def commit(self, x: Array) -> None:
-        _, gap, length = self._gaps(x)
-        beyond = np.maximum(length - self._limit / self._k_t, 0.0)
-        self._slip = self._slip + (beyond / np.maximum(length, 1e-300))[..., None] * gap
-
-    def save(self) -> Any:
-        return self._limit, self._slip
-
-    def restore(self, state: Any) -> None:
-        self._limit, self._slip = state

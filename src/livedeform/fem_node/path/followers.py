@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from livedeform.common.errors import ConvergenceError
 from livedeform.common.types import Array
 from livedeform.fem_node.embedded_points import EmbeddedPoints
+from livedeform.fem_node.items.friction import FrictionSupport
 from livedeform.fem_node.items.protocol import Moment
 from livedeform.fem_node.path.direction import Direction, MomentOf
 from livedeform.fem_node.path.mechanics import Mechanics
@@ -58,6 +59,12 @@ class Follower:
         """Let multipliers, limits and plastic flow follow where it is next to the leader's solution ``x``."""
         for item in self.mechanics.items:
             item.update(x + self.delta)
+
+    def let_slip(self, x: Array) -> None:
+        """Let the limits of friction with the support follow, which its slip goes by."""
+        for item in self.mechanics.items:
+            if isinstance(item, FrictionSupport):
+                item.update(x + self.delta)
 
 
 class Followers:
@@ -129,6 +136,7 @@ class Followers:
         residual = self.leader.residual(x, self._system).copy()
         for member in members:
             member.follow(self.leader)
+            member.let_slip(x)
             if self.linear:  # plastic flow and the like, before the only correction
                 member.update(x)
         unsettled = members[1:]
@@ -138,6 +146,8 @@ class Followers:
             for i in range(most):
                 correction = self._corrected(members, x, residual, held)
                 if self.linear:
+                    for member in members:
+                        member.let_slip(x)
                     return []
                 for member in members:
                     member.update(x)
@@ -158,7 +168,7 @@ class Followers:
         for k, member in enumerate(members):
             block[:, k] = residual - member.mechanics.residual(x + member.delta, self._system)
         block[held] = 0.0
-        correction: Array = self.leader.solver.linear.solve_exactly(block)
+        correction: Array = self.leader.solver.answering.solve_exactly(block)
         for k, member in enumerate(members):
             member.delta = member.delta + correction[:, k]
         return correction

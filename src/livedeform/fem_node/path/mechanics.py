@@ -338,7 +338,7 @@ class Mechanics:
         try:
             for item in self.items:
                 item.stiffen(x)
-            self.solver.factorise_at(x)
+            self.solver.linearise_at(x)
             yield
         finally:
             self.restore(saved)

@@ -11,6 +11,8 @@ C under these springs (the direct differentiation of a path, Tortorelli & Michal
 
     d = d_free - (K + S)^-1 g,    [1 + (D - S) C] g = (D - S) w_free + h.
 
+Where the support slips too, K + D and what that adds are one factor that is not symmetric, without springs.
+
 Whole runs with the change and without are the same but for what lies between them: points that begin to stick, to slide
 or to touch. Where that is most of the answer, as of a sideways move, two runs to either side differ by as much.
 """
@@ -27,10 +29,12 @@ from livedeform.common import frames
 from livedeform.common.errors import ConvergenceError
 from livedeform.common.types import Array
 from livedeform.fem_node.contact.slope import Anchors, Slope
+from livedeform.fem_node.items.friction import FrictionSupport
 from livedeform.fem_node.items.protocol import Moment
 from livedeform.fem_node.path.direction import Direction, MomentOf
 from livedeform.fem_node.path.mechanics import Mechanics
 from livedeform.fem_node.path.tangents import Followed, ItemResiduals, Tangents
+from livedeform.fem_node.solve.assembly import Feedback
 from livedeform.fem_node.solve.linear_solver import FactorisationError, make_condensing
 
 # of the contact's penalty, tried until the body is stable: about as stiff as the body, so that C tells of both
@@ -69,6 +73,7 @@ class RubbingTangents(Tangents):
         if contact is None or probe is None:
             raise ValueError("there is no probe that rubs")
         self._contact = contact
+        self._on_friction = any(isinstance(item, FrictionSupport) for item in leader.items)
         own = [d.physics.probe or probe for d in directions]
         self._numbers = np.array([[o.friction - probe.friction, o.adhesion - probe.adhesion] for o in own]).T
         self._numbers[~np.isfinite(self._numbers)] = 0.0
@@ -87,7 +92,7 @@ class RubbingTangents(Tangents):
         if slope is None and not there and np.abs(x - last.x).max() < NEAR:
             self._last = replace(last, shifts=shifts)
             return
-        followed = Followed(self.leader, x)
+        followed = Followed(self.leader, x, there=there)
         d, pushed = self._answers(followed, moments, shifts, slope, last)
         for k, neighbour in enumerate(self.neighbours):
             neighbour.correct(d[:, k], None, last=True)
@@ -117,23 +122,48 @@ class RubbingTangents(Tangents):
     ) -> tuple[Array, Array]:
         """Return the changes (n_dof, p) m of the unknowns and (n_dof, p) N of the probe's part of the residual."""
         x, held = followed.x, self.leader.held()
-        springs = self._factorise(x, slope, held)
+        springs = None if self._on_friction else self._factorise(x, slope, held)
         residuals = ItemResiduals(self._system, x)
         block = np.empty((len(x), len(moments)), order="F")
         for k, (neighbour, moment) in enumerate(zip(self.neighbours, moments, strict=True)):
             neighbour.begin(followed, moment, None)
             block[:, k] = neighbour.first_load(residuals, held)
         block[held] = 0.0
+        if springs is None:
+            pulls = None if slope is None else self._pulls(slope, shifts, last)
+            return self._whole_answers(x, block, slope, pulls)
         d, pushed = -self._linear.solve(block), np.zeros_like(block)
         if slope is None:
             return d, pushed
-        anchors = last.anchors.at(slope, last.d, last.shifts, shifts)
-        dofs, g, pushed_there = _under_probe(slope, springs, d, slope.pulls(anchors, shifts, self._numbers))
+        dofs, g, pushed_there = _under_probe(slope, springs, d, self._pulls(slope, shifts, last))
         pushed[dofs] = pushed_there
         block[:] = 0.0
         block[dofs] = g
         block[held] = 0.0
         return d - self._linear.solve(block), pushed
+
+    def _pulls(self, slope: Slope, shifts: Array, last: _StepEnd) -> Array:
+        """Return what the probe's facets pull with (m, 3 b, p) N while the nodes keep still."""
+        anchors = last.anchors.at(slope, last.d, last.shifts, shifts)
+        return slope.pulls(anchors, shifts, self._numbers)
+
+    def _whole_answers(self, x: Array, loads: Array, slope: Slope | None, pulls: Array | None) -> tuple[Array, Array]:
+        """Return what `_answers` does where the support slips too: with all that is not symmetric in one factor, in
+        double precision, which the stiff springs of such a support need."""
+        held, contact, more = self.leader.held(), self._contact, self.leader.solver.feedback(x)
+        self._tangent(x, None, 0.0, held, safe=False)
+        pushed = np.zeros_like(loads)
+        if slope is not None and pulls is not None:
+            blocks = np.zeros((*contact.dofs.shape, contact.dofs.shape[1]))
+            blocks[slope.facets] = slope.blocks()
+            more = [*more, Feedback(contact.dofs, blocks)]
+            np.add.at(pushed, slope.dofs, pulls)
+            loads = loads + pushed
+            loads[held] = 0.0
+        d = -self.leader.solver.whole(self._system, more).solve(loads)
+        if slope is not None:
+            np.add.at(pushed, slope.dofs, slope.blocks() @ d[slope.dofs])
+        return d, pushed
 
     def _factorise(self, x: Array, slope: Slope | None, held: NDArray[np.int64]) -> _EvenSprings:
         """Factorise the body's tangent at ``x`` with springs under the probe; `ConvergenceError` if it cannot be."""
@@ -167,6 +197,7 @@ class RubbingTangents(Tangents):
         """Sum the tangent (a ``safe`` one) at ``x`` of all items but the contact, with springs instead of that."""
         system, contact, pattern = self._system, self._contact, self.leader.solver.pattern
         system.safe = safe
+        self.leader.solver.expect(x, None)  # the exact tangent, not what the search's last step promised
         system.clear(tangent=True)
         for item in self.leader.items:
             if item is not contact:

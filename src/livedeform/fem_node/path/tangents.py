@@ -14,6 +14,9 @@ springs give, which multipliers take over.
 Of a probe that rubs tangents at the moments alone leave out what slid and stuck on the path: they are taken at each of
 its steps (`fem_node.path.rubbing`). Of one that begins to rub they are good, where the leader's pressures are those
 that limit the friction: it is followed with the body's compliance (`fem_node.contact.drag`).
+
+Where the body slips on its support each neighbour has slip of its own (`fem_node.items.friction`), and limits follow
+the pressure in the factor itself, one that is not symmetric (`fem_node.solve.whole_tangent`).
 """
 
 from __future__ import annotations
@@ -28,8 +31,10 @@ from numpy.typing import NDArray
 from livedeform.common.types import Array
 from livedeform.fem_node.contact.contact import Local, ProbeContact, make_contact
 from livedeform.fem_node.contact.drag import Drag
+from livedeform.fem_node.element.element import Space
 from livedeform.fem_node.embedded_points import EmbeddedPoints
 from livedeform.fem_node.items.continuum import Continuum
+from livedeform.fem_node.items.friction import FrictionSupport, SlipAlong
 from livedeform.fem_node.items.loads import Dead, Weight
 from livedeform.fem_node.items.protocol import Item, Moment
 from livedeform.fem_node.items.supports import Springs, make_supports
@@ -141,10 +146,11 @@ class ItemResiduals:
 
 
 class Followed:
-    """Strain and stress at the leader's solution ``x``, worked out once for all that begin to remember them."""
+    """Strain and stress at the leader's solution ``x``, worked out once for all that begin to remember them;
+    ``there``: that of a moment that was asked for, not one on the way."""
 
-    def __init__(self, leader: Mechanics, x: Array) -> None:
-        self.x, self._continuum = x, leader.continuum
+    def __init__(self, leader: Mechanics, x: Array, *, there: bool) -> None:
+        self.x, self.there, self._continuum = x, there, leader.continuum
 
     @cached_property
     def strain(self) -> Array:
@@ -166,6 +172,7 @@ class Neighbour:
         self.leader, self.direction = leader, direction
         reference, changed = direction.reference or leader.physics, direction.physics
         reshaped = unloaded is not leader.unloaded
+        self._reshaped = _unknowns(leader.space, unloaded) - _unknowns(leader.space, leader.unloaded)
         self.replaced: list[tuple[list[Item], list[Item]]] = []  # the leader's items, and its own instead
         self.continuum = self._own_continuum(reference, unloaded)
         self._own_weight(reference, reshaped=reshaped)
@@ -175,18 +182,22 @@ class Neighbour:
             self.replaced.append((dead, [Dead(leader.space, load) for load in changed.loads]))
         body = self.continuum or leader.continuum
         self.gives = yielding_support(leader.space, reference, changed, body.modulus_behind)
-        self._sprung = _only_springs_change(reference, changed)
+        sprung = _only_springs_change(reference, changed)
         another = self.continuum is not None or changed.supports != reference.supports  # springs go by the modulus
-        if (self.gives is None or self._sprung) and another:
+        if (self.gives is None or sprung) and another:
             own = _springs_of(make_supports(leader.space, changed, body.modulus_behind, unloaded))
             self.replaced.append((_springs_of(leader.items), own))
+        self._own_friction = self._friction_with(body, unloaded)
+        leaders = [item for item in leader.items if isinstance(item, FrictionSupport)]
+        self._slips = [SlipAlong(*pair) for pair in zip(leaders, self._own_friction, strict=False)]
         before, now = memory_of(reference), memory_of(changed)
         probe, other = changed.probe, reference.probe
         moves_in_time = probe is not None and other is not None and probe.time_offset != other.time_offset
         self.passing = moves_in_time or any(m.drifts or m.relaxes or m.sets for m in (before, now))
         self.drag = _begins_to_rub(leader, changed)
-        self.passing |= self.drag is not None
-        self.remembers = self.drag is not None or (self.continuum is not None and bool(now.relaxes or now.sets))
+        self.passing |= self.drag is not None or bool(self._slips)
+        self._fades = self.continuum is not None and bool(now.relaxes or now.sets)
+        self.remembers = self.drag is not None or self._fades or bool(self._slips)
         self._begins = not reshaped and _begins_to_remember(leader.physics, changed)
         self.delta = self.slope = self._moved = self._taken_over = self._pushed = np.zeros(leader.space.n_dof)
         self._at_rest = self.delta  # before weight and loads act
@@ -200,6 +211,15 @@ class Neighbour:
         continuum = Continuum(leader.space, changed, unloaded)
         self.replaced.append(([leader.continuum], [continuum]))
         return continuum
+
+    def _friction_with(self, body: Continuum, unloaded: Array | None) -> list[FrictionSupport]:
+        """Return its own friction with the supports, where the leader has as much: each slips on a path of its own."""
+        n = sum(isinstance(item, FrictionSupport) for item in self.leader.items)
+        if not n:
+            return []
+        supports = make_supports(self.leader.space, self.direction.physics, body.modulus_behind, unloaded)
+        own = [item for item in supports if isinstance(item, FrictionSupport)]
+        return own if len(own) == n else []
 
     def _penalty_change(self) -> float:
         """Return by which share the penalty that holds the surface back differs: it goes by the modulus there."""
@@ -221,6 +241,8 @@ class Neighbour:
         for _, own in self.replaced:
             for item in own:
                 item.prepare(moment)
+        for friction in self._own_friction:
+            friction.prepare(moment)
         if self.continuum is not None:
             if self.direction.physics.plastic_set is not None and self.leader.physics.plastic_set is not None:
                 self.continuum.set_like(self.leader.continuum)
@@ -242,17 +264,20 @@ class Neighbour:
             r += residuals.at(residuals.x, own) - residuals.of_leader(leaders)
         if self.drag is not None and self.leader.contact is not None:
             self._moved = self._moved + self.drag.load(residuals.x, self.leader.contact, self._compliance)
+        for slip in self._slips:
+            r += slip.load(residuals.x)
         r += self._moved
         self.imposed: Array | float = 0.0
         if self.gives is None:
             return r
         everything = residuals.of_leader(self.leader.items)
         imposed = self.gives.imposed(everything, held)
+        imposed[held] += self._reshaped[held] / self.direction.width  # it gives from where it is slack
         e = SMALL / max(float(np.abs(imposed).max()), 1e-12)
         moved = residuals.at(residuals.x + e * imposed, self.leader.items)
         self.imposed = self.direction.width * imposed
         along = self.direction.width * (moved - everything) / e
-        return along + r if self._sprung else along
+        return along + r
 
     def _compliance(self, dofs: NDArray[np.int64]) -> Array:
         """Return how the ``dofs`` (k,) move (k, k) m under 1 N at each of them, with the leader's factor."""
@@ -260,7 +285,7 @@ class Neighbour:
         for some in np.array_split(np.flatnonzero(free), len(dofs) // AT_ONCE + 1):
             forces = np.zeros((len(self.delta), len(some)), order="F")
             forces[dofs[some], np.arange(len(some))] = 1.0
-            C[:, some] = self.leader.solver.linear.solve(forces)[dofs]
+            C[:, some] = self.leader.solver.answering.solve(forces)[dofs]
         return C
 
     def load(self, residuals: ItemResiduals, springs: _Springs | None) -> Array:
@@ -289,9 +314,13 @@ class Neighbour:
         self.delta = self._at_rest
         self.slope = self.delta / self.direction.width
         self._moved = self._taken_over = self._pushed = np.zeros_like(self.delta)
-        if self.continuum is not None and self.remembers:
+        if self.continuum is not None and self._fades:
             self.continuum.prepare(moment)
             self.continuum.commit(self.leader.at_rest + self.delta)
+        for friction in self._own_friction:
+            friction.prepare(moment)
+        for slip in self._slips:
+            slip.commit(self.leader.at_rest, self.delta, there=True)
 
     def commit(self, followed: Followed) -> None:
         """Take its own path into its history: of what begins to remember that is the leader's, to first order."""
@@ -299,7 +328,9 @@ class Neighbour:
             self._at_rest = self.delta
         if self.drag is not None:
             self.drag.commit(followed.x)
-        if self.continuum is None or not self.remembers:
+        for slip in self._slips:
+            slip.commit(followed.x, self.delta, there=followed.there)
+        if self.continuum is None or not self._fades:
             return
         if self._begins:
             sets, relaxes = self.direction.physics.plastic_set is not None, self.direction.physics.prony is not None
@@ -347,7 +378,7 @@ class Tangents:
         with leader.factorised_at(x, keep=False):
             contact = leader.contact if leader.contact is not None and leader.contact.T is not None else None
             springs = None if contact is None else _Springs(contact, x)
-            followed = Followed(leader, x)
+            followed = Followed(leader, x, there=there)
             for neighbour in asked:
                 neighbour.begin(followed, moment_of(neighbour.direction.physics), springs)
             self._answer(asked, x, springs)
@@ -362,7 +393,7 @@ class Tangents:
             for k, neighbour in enumerate(asked):
                 block[:, k] = neighbour.load(residuals, springs) if i else neighbour.first_load(residuals, held)
             block[held] = 0.0
-            correction = -self.leader.solver.linear.solve_exactly(block)
+            correction = -self.leader.solver.answering.solve_exactly(block)
             for k, neighbour in enumerate(asked):
                 neighbour.correct(correction[:, k], springs, last=i + 1 == self._corrections)
 
@@ -409,6 +440,14 @@ def _only_springs_change(reference: Physics, changed: Physics) -> bool:
     """Return whether the supports that differ are springs in both."""
     pairs = [(a, b) for a, b in zip(reference.supports, changed.supports, strict=True) if a != b]
     return {support.type for pair in pairs for support in pair} == {"spring"}
+
+
+def _unknowns(space: Space, u: Array | None) -> Array:
+    """Return unknowns (n_dof,) with the displacements ``u`` (n, 3) m; None: none."""
+    out = np.zeros(space.n_dof)
+    if u is not None:
+        out[: u.size] = u.ravel()
+    return out
 
 
 def _springs_of(items: Sequence[Item]) -> list[Item]:

@@ -17,8 +17,9 @@ from numpy.typing import NDArray
 from livedeform.common.errors import ConvergenceError
 from livedeform.common.types import Array
 from livedeform.fem_node.element.element import Space
+from livedeform.fem_node.items.friction import FrictionSupport
 from livedeform.fem_node.items.protocol import Moment
-from livedeform.fem_node.items.supports import FrictionSupport, set_unloaded
+from livedeform.fem_node.items.supports import set_unloaded
 from livedeform.fem_node.path.direction import Direction, same_physics
 from livedeform.fem_node.path.mechanics import Mechanics
 from livedeform.fem_node.physics.memory import as_scanned, memory_of
@@ -67,6 +68,11 @@ class InverseProblem:
         self._set(w, fraction)
         self.mechanics.solver.factorise_at(self._zero)
 
+    def linearise(self, w: Array, fraction: float) -> None:
+        """Take the tangent with what friction's limits add, for small changes beside the solution ``w``."""
+        self._set(w, fraction)
+        self.mechanics.solver.linearise_at(self._zero)
+
     def try_factor(self, w: Array, fraction: float) -> bool:
         """Call `factorise`; return False if that cannot be."""
         try:
@@ -88,12 +94,14 @@ class InverseProblem:
 
     def update(self, w: Array, fraction: float) -> bool:
         """Take the limits of friction with the support from the pressure; return True while they still move."""
+        if not self.slips:
+            return False
         self._set(w, fraction)
         return any([item.update(self._zero) for item in self.mechanics.items])  # every item is asked
 
     def response(self, r: Array) -> Array:
         """Return K^-1 r as nodal displacements (n, 3), or (n, 3, k) of several."""
-        solved = self.mechanics.solver.linear.solve_exactly(r)[: 3 * self.space.n_nodes]
+        solved = self.mechanics.solver.answering.solve_exactly(r)[: 3 * self.space.n_nodes]
         return solved.reshape(-1, 3, *r.shape[1:])
 
     def _set(self, w: Array, fraction: float) -> None:
@@ -203,10 +211,12 @@ def _followed(problem: InverseProblem, w: Array, changed: Sequence[InverseProble
     """
     if not changed:
         return []
-    problem.factorise(w, 1.0)
+    problem.linearise(w, 1.0)
     bodies = [problem, *changed]
     for body in changed:
         body.take_friction(problem)
+    for body in bodies:
+        body.update(w, 1.0)  # limits of its own: with the leader's a change of friction alone moves nothing
     system = System(problem.mechanics.solver.pattern)
     shapes = [[w] for _ in bodies]
     steps: list[list[Array]] = [[] for _ in bodies]
@@ -218,8 +228,7 @@ def _followed(problem: InverseProblem, w: Array, changed: Sequence[InverseProble
         for k, body in enumerate(bodies):
             steps[k] = [*steps[k][-MEMORY:], response[:, :, k]]
             shapes[k] = [*shapes[k][-MEMORY:], accelerated(shapes[k], steps[k])]
-            if body.slips:
-                body.update(shapes[k][-1], 1.0)
+            body.update(shapes[k][-1], 1.0)
         moved = np.abs(response - response[:, :, :1]).max(axis=(0, 1))
         sizes = np.array([np.abs(own[-1] - shapes[0][-1]).max() for own in shapes])
         if np.all(moved <= ACCURACY * sizes + ROUND_OFF):

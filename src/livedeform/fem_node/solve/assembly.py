@@ -7,10 +7,11 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array, csr_array
+from scipy.sparse import coo_array, csr_array, tril
 
 from livedeform.common.compiled import njit
 from livedeform.common.types import Array
@@ -38,12 +39,24 @@ class Pattern:
                 rows, columns = rows[kept], columns[kept]
             part = coo_array((np.ones(len(rows), np.int8), (rows, columns)), shape=pattern.shape).tocsr()
             pattern = pattern + part
-        pattern = (pattern + csr_array((np.ones(n_dof, np.int8), (range(n_dof), range(n_dof))))).tocsr()
+        self._take((pattern + csr_array((np.ones(n_dof, np.int8), (range(n_dof), range(n_dof))))).tocsr())
+
+    def _take(self, pattern: csr_array) -> None:
+        """Take the entries that a ``pattern`` (n_dof, n_dof) stores."""
         pattern.sort_indices()
         self.indptr, self.indices = pattern.indptr.astype(np.int32), pattern.indices.astype(np.int32)
-        self.rows = np.repeat(np.arange(n_dof, dtype=np.int32), np.diff(self.indptr))
+        self.rows = np.repeat(np.arange(self.n_dof, dtype=np.int32), np.diff(self.indptr))
         self.diagonal = np.flatnonzero(self.rows == self.indices)
         self._positions: dict[bytes, Positions] = {}  # by what tells the dofs apart
+
+    def whole(self) -> tuple[Pattern, Indices]:
+        """Return the pattern with both triangles, and where each of its entries is stored in this one (nnz,)."""
+        numbers = csr_array((np.arange(1, self.nnz + 1), self.indices, self.indptr), shape=(self.n_dof, self.n_dof))
+        if self.symmetric:
+            numbers = (numbers + tril(numbers.T, -1)).tocsr()
+        out = Pattern(self.n_dof, (), symmetric=False)
+        out._take(numbers)
+        return out, numbers.data - 1
 
     @property
     def nnz(self) -> int:
@@ -86,6 +99,13 @@ def _told_apart_by(arrays: Sequence[Indices]) -> bytes:
     for a in arrays:
         told.update(np.ascontiguousarray(a).data)
     return told.digest()
+
+
+class Feedback(NamedTuple):
+    """Blocks (m, k, k) N/m at ``dofs`` (m, k) of a tangent, not symmetric."""
+
+    dofs: Indices
+    blocks: Array
 
 
 class System:

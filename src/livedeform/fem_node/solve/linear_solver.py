@@ -54,12 +54,8 @@ class FactorisationError(Exception):
     """The matrix is singular, or not positive definite where it should be."""
 
 
-class LinearSolver(Protocol):
-    """A kept factorisation of the tangent."""
-
-    def factorise(self, system: System) -> None:
-        """Factorise the system's values; `FactorisationError` if that cannot be."""
-        ...
+class Factor(Protocol):
+    """A kept factorisation K."""
 
     def solve(self, right_hand_side: Array) -> Array:
         """Return K^-1 b for b (n,) or (n, k), as exactly as Newton's iterations need it."""
@@ -70,18 +66,32 @@ class LinearSolver(Protocol):
         ...
 
 
+class LinearSolver(Factor, Protocol):
+    """A kept factorisation of the tangent."""
+
+    def factorise(self, system: System) -> None:
+        """Factorise the system's values; `FactorisationError` if that cannot be."""
+        ...
+
+
 def make_linear_solver(
-    pattern: Pattern, *, n_negative: int = 0, threads: int | None = None, single: bool = False
+    pattern: Pattern,
+    *,
+    n_negative: int = 0,
+    threads: int | None = None,
+    single: bool = False,
+    nearly_symmetric: bool = False,
 ) -> LinearSolver:
     """Make the fastest solver that is installed. ``n_negative``: how many negative eigenvalues a stable symmetric
     tangent has (0: positive definite, Cholesky; as many as there are pressures: a saddle point). ``single``: with a
-    factor in single precision where that is possible."""
+    factor in single precision where that is possible; ``nearly_symmetric``: of a matrix that is not, but has
+    pivots on its diagonal."""
     if PyPardisoSolver is not None:
         threads = threads or DEFAULT_THREADS
         try:
             if single and pattern.symmetric and not n_negative:
                 return SinglePrecision(pattern, threads)
-            return Pardiso(pattern, n_negative=n_negative, threads=threads)
+            return Pardiso(pattern, n_negative=n_negative, threads=threads, nearly_symmetric=nearly_symmetric)
         except ImportError:  # pypardiso without the MKL library
             pass
     _warn_slow()
@@ -92,11 +102,18 @@ class Pardiso:
     """PARDISO with its symbolic analysis reused: Cholesky, symmetric indefinite LDL^T or LU, as the pattern allows."""
 
     def __init__(
-        self, pattern: Pattern, *, n_negative: int = 0, threads: int = DEFAULT_THREADS, single: bool = False
+        self,
+        pattern: Pattern,
+        *,
+        n_negative: int = 0,
+        threads: int = DEFAULT_THREADS,
+        single: bool = False,
+        nearly_symmetric: bool = False,
     ) -> None:
         self.pattern, self.n_negative = pattern, n_negative
         self._type: Any = np.float32 if single else np.float64
         self.mtype = (_SYMMETRIC if n_negative else _SPD) if pattern.symmetric else _GENERAL
+        self._matches = self.mtype != _SPD and not nearly_symmetric  # looks at the values when it analyses
         kind = self.mtype, single, threads
         self._handle = _lent(pattern, kind)
         os.environ.setdefault("PYPARDISO_MKL_RT", self._handle.libmkl._name)  # wherever else it was found
@@ -105,7 +122,7 @@ class Pardiso:
         iparm[0] = 1  # the values below, not the defaults
         iparm[1] = 2  # nested dissection (METIS)
         iparm[9] = 8 if self.mtype == _SYMMETRIC else 13  # pivot perturbation 1e-8, 1e-13
-        iparm[10] = iparm[12] = 0 if self.mtype == _SPD else 1  # scaling and matching
+        iparm[10] = iparm[12] = int(self._matches)  # scaling and matching
         iparm[20] = 1  # Bunch-Kaufman
         iparm[27] = int(single)
         iparm[34] = 1  # indices from 0
@@ -116,7 +133,7 @@ class Pardiso:
         self._values[:] = system.values
         if not np.all(np.isfinite(self._values)):
             raise FactorisationError("the tangent is not finite")
-        if not self._handle.analysed or self.mtype != _SPD:  # matching looks at the values
+        if not self._handle.analysed or self._matches:
             self._call(_ANALYSE, np.zeros(self.pattern.n_dof, self._type))
             self._handle.analysed = True
         self._call(_FACTORISE, np.zeros(self.pattern.n_dof, self._type))

@@ -26,10 +26,10 @@ ROUND_OFF = 1e-5  # m: a correction that is smaller, and still does not better t
 
 @dataclass(frozen=True)
 class Lost(Exception):
-    """No equilibrium was found; ``dof`` where it is worst."""
+    """No equilibrium was found; ``dof`` where it is worst, if that is known."""
 
     why: str
-    dof: int = 0
+    dof: int | None = None
 
 
 class Tangents(Protocol):
@@ -125,8 +125,8 @@ class Newton:
 
     def _iterate(self) -> Array | None:
         """Take one correction; return the equilibrium once it is there."""
-        if not self.solver.has_factor:
-            self._factorise()
+        if not self.solver.has_factor and not self._has_fresh_factor():
+            return None
         step = self._full_step()
         if self._trial is not None and self._here:
             if step.size > WATCHDOG * self._trial.size:
@@ -164,6 +164,19 @@ class Newton:
         self.n_factorisations += 1
         self.solver.learned.clear()
         self._here, self._best, self._slow = True, np.inf, 0
+
+    def _has_fresh_factor(self) -> bool:
+        """Make a fresh factor; return False, back where a step on trial began, if that leads to where there is none: it
+        may have crushed elements."""
+        try:
+            self._factorise()
+        except Lost:
+            if self._trial is None:
+                raise
+            self.solver.expect(self.x, None)
+            self._go_back(self._trial)
+            return False
+        return True
 
     def _full_step(self) -> _Step:
         """Return Newton's step, with what has been learned since the factor was made."""

@@ -18,10 +18,11 @@ from livedeform.common.types import Array
 from livedeform.fem_node.contact.contact import GAP_TOLERANCE, Local
 from livedeform.fem_node.items.protocol import Item, Moment
 from livedeform.fem_node.solve.agreement import End, SeveralEquilibria, agree, several
-from livedeform.fem_node.solve.assembly import System, pattern_of
+from livedeform.fem_node.solve.assembly import Feedback, System, pattern_of
 from livedeform.fem_node.solve.condensed_search import CondensedSearch, NotFound
-from livedeform.fem_node.solve.linear_solver import FactorisationError, LinearSolver, make_linear_solver
+from livedeform.fem_node.solve.linear_solver import Factor, FactorisationError, LinearSolver, make_linear_solver
 from livedeform.fem_node.solve.newton import Learned, Lost, Newton
+from livedeform.fem_node.solve.whole_tangent import WholeTangent
 
 LATELY = 0.2  # weight of a moment's iterations in their mean
 MOST_STEPS = 200  # of one walk
@@ -121,6 +122,8 @@ class Solver:
             in_motion = self.settings.in_motion
             self._condensed = CondensedSearch.of(self.items, self.pattern, self.threads, in_motion=in_motion)
         self.has_factor = False
+        self.answering: Factor = self.linear  # for sensitivities, after `linearise_at`
+        self._whole: WholeTangent | None = None
         self.learned = Learned()
         self.learns = self.pattern.symmetric and not self.n_negative
         self.size = float(np.ptp(self.positions, axis=0).max())
@@ -270,11 +273,13 @@ class Solver:
     def _explain(self, lost: Lost | ConvergenceError, done: float) -> ConvergenceError:
         if isinstance(lost, ConvergenceError):  # an item's own
             return ConvergenceError(lost.what, where=f"after {100.0 * done:.0f} % of the load step", remedy=lost.remedy)
-        point = self.positions[min(lost.dof // 3, len(self.positions) - 1)]
-        place = ", ".join(f"{1e3 * c:.1f}" for c in point)
+        worst = ""
+        if lost.dof is not None:
+            point = self.positions[min(lost.dof // 3, len(self.positions) - 1)]
+            worst = f", worst at ({', '.join(f'{1e3 * c:.1f}' for c in point)}) mm"
         return ConvergenceError(
             f"no equilibrium was found ({lost.why})",
-            where=f"after {100.0 * done:.0f} % of the load step, worst at ({place}) mm",
+            where=f"after {100.0 * done:.0f} % of the load step{worst}",
             remedy="move the probe in smaller steps, check support and modulus (a soft body may buckle or collapse "
             "under its weight), or refine the mesh there",
         )
@@ -410,6 +415,7 @@ class Solver:
 
     def factorise_at(self, x: Array) -> None:
         """Factorise the tangent of the prepared items at ``x``; `ConvergenceError` if it cannot be."""
+        self.answering = self.linear
         self._hold(x)
         self.expect(x, None)
         self.evaluate(x, self.system, tangent=True)
@@ -417,6 +423,31 @@ class Solver:
             self.factorise(x)
         except Lost as lost:
             raise self._explain(lost, 0.0) from lost
+
+    def linearise_at(self, x: Array) -> None:
+        """Have ``answering`` solve for small changes beside the solution ``x`` of the prepared moment: with the
+        tangent's factor, or one with what that leaves out. `ConvergenceError` if it cannot be."""
+        more = self.feedback(x)
+        if not more:
+            self.factorise_at(x)
+            return
+        self._hold(x)
+        self.expect(x, None)
+        self.evaluate(x, self.system, tangent=True)
+        self.answering = self.whole(self.system, more)
+
+    def feedback(self, x: Array) -> list[Feedback]:
+        """Return what the items' tangents at the solution ``x`` leave out."""
+        return [more for item in self.items if (more := item.feedback(x)) is not None]
+
+    def whole(self, system: System, more: Sequence[Feedback]) -> WholeTangent:
+        """Return the factorised tangent in ``system``, held dofs out, with what there is ``more``."""
+        self._whole = self._whole or WholeTangent(self.pattern, n_negative=self.n_negative, threads=self.threads)
+        try:
+            self._whole.factorise(system, more, self._held)
+        except FactorisationError as error:
+            raise self._explain(Lost("the tangent is singular"), 0.0) from error
+        return self._whole
 
     def response(self, part: Local, load: Array, x: Array) -> Array:
         """Return how the unknowns (n_dof,) yield to a small ``load`` (n_dof,) N on the facets of a contact's ``part``
