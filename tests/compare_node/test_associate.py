@@ -82,6 +82,7 @@ def test_order_of_arrival_does_not_change_the_residuals():
     assert repr(results["measured first"]) == repr(results["predicted first"]) == repr(results["by stamp"])
 
 
+STAMPED = 1e-11  # m: at 10 mm/s, stamps that are whole nanoseconds
 PRESSES = {
     "a smooth press": lambda t: 0.01 * np.sin(np.pi * np.clip(t, 0.0, 4.0) / 4.0) ** 2,
     "a probe that touches": lambda t: np.maximum(0.0, 0.013 * np.sin(np.pi * np.clip(t, 0.0, 4.0) / 4.0) - 0.003),
@@ -106,7 +107,9 @@ def test_no_frame_is_further_off_than_interpolation_is_said_to_be(press: str, ra
             out += associator.add_measured(m) if isinstance(m, MarkerFrame) else associator.add_predicted(m)
         out += associator.flush()
         wrong, bound = max(r.distances.max() for r in out), associator.interpolation_bound.value
-        assert wrong < 1.6 * bound  # measured up to 1.48, of a probe that touches and slows down at once; it was 4.67
+        assert (
+            wrong < 1.6 * bound + STAMPED
+        )  # measured up to 1.48, of a probe that touches and slows down at once; it was 4.67
         largest.append((wrong, bound))
     wrong, bound = np.max(largest, axis=0)
     assert bound < 5.0 * wrong  # measured 1.0 to 3.9 times: what is much too large would doubt everything
@@ -136,7 +139,7 @@ def test_a_marker_that_moves_in_steps_is_no_further_off_than_is_said(seconds: fl
             np.arange(0.0, 5.0, 1.0 / 30.0),
         )
         wrong = max(r.distances.max() for r in residuals)
-        assert wrong < 1.1 * associator.interpolation_bound.value  # measured up to 1.00; it was up to 6.3
+        assert wrong < 1.1 * associator.interpolation_bound.value + STAMPED  # measured up to 1.00; it was up to 6.3
 
 
 def in_pairs(every: float, apart: float) -> np.ndarray:
@@ -162,11 +165,32 @@ def test_noise_between_predictions_close_together_is_no_bend(stamps: str):
     assert found.largest < 2.0e-4  # measured 0.11 to 0.15 mm; it was 0.70 with a pause, 1.3 and 12 in pairs
 
 
+@pytest.mark.parametrize("noise", [1e-8, 5e-6])
+@pytest.mark.parametrize("rate", [2.1, 5.0, 20.0])
+def test_what_is_judged_is_near_what_interpolation_adds(rate: float, noise: float):
+    """A press with a constant speed: noise of 10 nm made 0.67 mm of nothing, and the worst marker of each frame counted
+    for all."""
+    rng, apart = np.random.default_rng(0), []
+    for phase in np.linspace(0.0, 1.0 / rate, 4, endpoint=False):
+        stamps = np.arange(phase, 20.0, 1.0 / rate)
+        residuals, associator = played(
+            lambda t: 0.005 * np.clip((np.minimum(t % 5.0, 4.0 - t % 5.0) - 1.0) / 0.4, 0.0, 1.0),
+            stamps,
+            np.arange(1.0, 19.0, 1.0 / 30.0),
+            noise * rng.standard_normal((len(stamps), 3)),
+        )
+        added = np.concatenate([r.distances for r in residuals])
+        judged = max(np.sqrt(np.mean(added**2)), np.percentile(added, 95))
+        apart.append([judged, associator.interpolation_bound.found.judged])
+    added, said = np.sqrt(np.mean(np.square(apart), axis=0))
+    assert 0.9 * added < said < 3.0 * added  # measured 1.00 to 2.7 times, at 10 nm and 5 Hz 1.7
+
+
 def test_what_is_judged_is_of_all_frames():
     """Of 100 frames that have predictions of their own and two between others, the two are not what is judged."""
     found = InterpolationBound()
     for _ in range(98):
-        found.add_exact()
+        found.add_exact(1)
     assert np.isnan(found.found.largest) and np.isnan(found.found.judged)  # none was interpolated
     x = [predicted(100.0 * k, [0], np.array([[0.0, 0.0, 0.001 * k**2]])) for k in range(4)]
     for stamp in (140, 150):

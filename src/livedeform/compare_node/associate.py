@@ -183,8 +183,9 @@ class Associator:
             if not second.converged:
                 self.counts.refused_not_converged += 1
                 return None
-            self.interpolation_bound.add_exact()
-            return self._residual(frame, second, 0.0)
+            residual = self._residual(frame, second, 0.0)
+            self.interpolation_bound.add_exact(0 if residual is None else len(residual.ids))
+            return residual
         if after == 0:
             self.counts.refused_extrapolation += 1
             return None

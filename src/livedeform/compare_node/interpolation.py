@@ -12,26 +12,26 @@ between the line and the lines of its neighbours going on, so that it is off by 
     min(|v1 - v0| (t - t0), |v2 - v1| (t1 - t)).
 
 Where they change to and fro, as of a marker that is still, moves and is still again, it may follow either line and then
-change over: the larger distance counts, as long as the marker can still change over at five times its mean speed. Where
-only one neighbour is known, its remainder is an estimate and no bound. A neighbour is at least half as far away as the
-bracket is long: the velocity over a shorter time is mostly noise, which the bracket would make as many times larger as
-it is longer.
+change over: the larger distance counts, as long as the marker can still change over at five times its mean speed, and
+no change counts as more than four times the other, which is noise where a velocity stays. Where only one neighbour is
+known, its remainder is an estimate and no bound. A neighbour is at least half as far away as the bracket is long: the
+velocity over a shorter time is mostly noise, which the bracket would make as many times larger as it is longer.
 """
 
 from __future__ import annotations
 
-from array import array
 from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
 
 from livedeform.common.types import Array, Ids, PredictedMarkers
-from livedeform.compare_node.metrics import p95, rmse
 
 __all__ = ["Interpolated", "InterpolationBound", "interpolate", "neighbour", "remainder"]
 
-QUICK = 4.0  # of a marker's change of velocity: by how much it is faster at most, within a bracket, than on average
+QUICK = 4.0  # by how much faster a marker is at most within a bracket than its change of velocity, and by how much the
+# change on one side of a bracket is larger at most than that on the other
+EDGES = np.geomspace(1e-9, 10.0, 2304)  # m: classes one percent wide, of which a percentile is told for hours on end
 Bracket = tuple[PredictedMarkers | None, PredictedMarkers, PredictedMarkers]
 """Two predictions, and a neighbour before them where one is known."""
 
@@ -48,7 +48,8 @@ def remainder(
     before: PredictedMarkers | None, first: PredictedMarkers, second: PredictedMarkers, stamp_ns: int
 ) -> float:
     """Return the largest |x''| (t - t0)(t1 - t) / 2 over the markers (m); NaN without one before t0."""
-    return _largest((before, first, second, None), stamp_ns)
+    bounds = _bounds((before, first, second, None), stamp_ns)
+    return float(bounds.max()) if len(bounds) else float("nan")
 
 
 def neighbour(
@@ -65,8 +66,8 @@ def neighbour(
 
 @dataclass(frozen=True)
 class Interpolated:
-    """Say by how much (m) interpolation can have been wrong: ``largest`` in any frame, over the markers, and ``judged``
-    in what is judged of all frames, their rmse and 95th percentile, the larger of the two; NaN where no frame was
+    """Say by how much (m) interpolation can have been wrong: ``largest`` of any marker in any frame, and ``judged`` in
+    what is judged of all of them, their rmse and 95th percentile, the larger of the two; NaN where no frame was
     interpolated, or nothing is known of it."""
 
     largest: float = float("nan")
@@ -82,20 +83,23 @@ class InterpolationBound:
     def __init__(self) -> None:
         self.value = float("nan")
         """The largest (m) over frames and markers; NaN where no frame was interpolated, or nothing is known of it."""
-        self._bounds = array("d")
+        self._n, self._squares = 0, 0.0  # of every marker in every frame
+        self._classes = np.zeros(len(EDGES) + 1, np.int64)  # how many of them are below and between the EDGES
         self._waiting: list[tuple[Bracket, int]] = []
 
     @property
     def found(self) -> Interpolated:
         """Return what is known of all frames so far."""
-        bounds = np.array(self._bounds)
         if not np.isfinite(self.value):
             return Interpolated()
-        return Interpolated(self.value, max(rmse(bounds), p95(bounds)))
+        p95 = float(EDGES[min(np.searchsorted(np.cumsum(self._classes), 0.95 * self._n), len(EDGES) - 1)])
+        rare = self._classes[0] >= 0.95 * self._n
+        return Interpolated(self.value, max(float(np.sqrt(self._squares / self._n)), 0.0 if rare else p95))
 
-    def add_exact(self) -> None:
-        """Take a frame that has a prediction of its own."""
-        self._bounds.append(0.0)
+    def add_exact(self, n: int) -> None:
+        """Take a frame of ``n`` markers that has a prediction of its own."""
+        self._n += n
+        self._classes[0] += n
 
     def add(self, bracket: Bracket, later: Iterable[PredictedMarkers], stamp_ns: int) -> None:
         """Take a frame at ``stamp_ns`` that was interpolated in a ``bracket``, with what is known ``later`` than it."""
@@ -115,24 +119,26 @@ class InterpolationBound:
                 self._waiting.append((bracket, stamp_ns))
 
     def _take(self, bracket: Bracket, after: PredictedMarkers | None, stamp_ns: int) -> None:
-        bound = _largest((*bracket, after), stamp_ns)
-        if np.isfinite(bound):
-            self.value = float(np.fmax(self.value, bound))
-            self._bounds.append(bound)
+        bounds = _bounds((*bracket, after), stamp_ns)
+        if len(bounds):
+            self.value = float(np.fmax(self.value, bounds.max()))
+            self._n += len(bounds)
+            self._squares += float(bounds @ bounds)
+            np.add.at(self._classes, np.searchsorted(EDGES, bounds), 1)
 
 
-def _largest(
+def _bounds(
     four: tuple[PredictedMarkers | None, PredictedMarkers, PredictedMarkers, PredictedMarkers | None], stamp_ns: int
-) -> float:
-    """Return by how much the line between the second and third of ``four`` predictions can be wrong at a stamp (m),
-    over the markers that are in all; NaN without a neighbour that converged."""
+) -> Array:
+    """Return by how much (m) the line between the second and third of ``four`` predictions can be wrong at a stamp, of
+    the markers that are in all; none without a neighbour that converged."""
     known = [p if p is not None and p.converged else None for p in four]
     there = [p for p in known if p is not None]
     ids = there[0].ids
     for p in there[1:]:
         ids = np.intersect1d(ids, p.ids)
     if len(there) < 3 or len(ids) == 0:
-        return float("nan")
+        return np.empty(0)
     t = [(p.stamp_ns - four[1].stamp_ns) * 1e-9 for p in there]
     x = [_rows(p, ids) for p in there]
     velocity = [(x[k + 1] - x[k]) / (t[k + 1] - t[k]) for k in range(len(there) - 1)]
@@ -141,10 +147,21 @@ def _largest(
     out = np.maximum(off[0], off[-1])
     if len(there) == 4:
         before, after = velocity[1] - velocity[0], velocity[2] - velocity[1]
-        one_way = np.minimum(np.abs(before) * s, np.abs(after) * left)
-        to_and_fro = np.maximum(np.abs(before) * min(s, QUICK * left), np.abs(after) * min(left, QUICK * s))
-        out = np.where(before * after >= 0.0, one_way, to_and_fro)
-    return float(np.nanmax(np.linalg.norm(out, axis=1)))
+        out = np.where(
+            before * after >= 0.0,
+            np.minimum(np.abs(before) * s, np.abs(after) * left),
+            _to_and_fro(np.abs(before), np.abs(after), s, left),
+        )
+    lengths = np.linalg.norm(out, axis=1)
+    return np.asarray(lengths[np.isfinite(lengths)])
+
+
+def _to_and_fro(before: Array, after: Array, s: float, left: float) -> Array:
+    """Return how far coordinates can be from the line, of changes of velocity (m, 3) m/s in opposite directions before
+    and after it, ``s`` s after its beginning and with so many ``left``."""
+    most = QUICK * np.minimum(before, after)
+    before, after = np.minimum(before, most), np.minimum(after, most)
+    return np.maximum(before * min(s, QUICK * left), after * min(left, QUICK * s))
 
 
 def _rows(prediction: PredictedMarkers, ids: Ids) -> Array:
