@@ -439,12 +439,15 @@ def _outward(experiment: Experiment, rest_points: Array | None) -> Array | None:
 def _rays_meet(measured: Triangulated) -> NDArray[np.bool_]:
     """Test (n,) the chi-square of each point (one degree of freedom) against how well the others' rays meet.
 
-    A calibration that is slightly off lets all of them miss.
+    A calibration that is slightly off lets all of them miss by as many pixels, however well their centres are known:
+    the variance by which half of them miss more than their own covariances let them is added to each one's own.
     """
     if len(measured.chi2) < MIN_MARKERS_TO_LEARN:
         return np.ones(len(measured.chi2), bool)
-    common = max(float(np.median(measured.chi2)) / MEDIAN_CHI2, 1.0)
-    return np.asarray(measured.chi2 < MOST_CHI2 * common)
+    missed = 2 * measured.reprojection_error_px**2
+    own = missed / np.maximum(measured.chi2, 1e-12)
+    common = max(float(np.median(missed / MEDIAN_CHI2 - own)), 0.0)
+    return np.asarray((missed < MOST_CHI2 * (own + common)) | (missed == 0))
 
 
 def empty_frame(stamp_ns: int) -> MarkerFrame:

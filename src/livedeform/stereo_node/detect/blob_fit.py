@@ -31,7 +31,8 @@ from livedeform.stereo_node.detect.blob_model import (
     profile,
     residuals,
 )
-from livedeform.stereo_node.detect.occlusion import MOST_HIDDEN, find_cut, find_hidden
+from livedeform.stereo_node.detect.cuts import SHORT, add_untold, find_cut, rim_off, unevenness
+from livedeform.stereo_node.detect.occlusion import MOST_HIDDEN, find_hidden
 from livedeform.stereo_node.detect.small_linear import copy_part, solve_spd
 
 N_RESULTS = N_PARAMETERS + 8
@@ -66,30 +67,62 @@ def start_parameters(centres: Array, radii: Array, background: Array, contrast: 
 
 @njit(cache=True, fastmath=True, error_model="numpy")
 def _fit_blobs(picture, start, margin_px, noise_floor, max_iterations, table):
-    out = np.zeros((start.shape[0], N_RESULTS))
-    hidden = np.zeros(N_SECTORS, np.bool_)
-    sums = np.empty((4, N_SECTORS))
-    work = np.empty((N_WORK, 0))
-    for b in range(start.shape[0]):
-        p = start[b].copy()
-        hidden[:] = False
-        for _ in range(5):
-            status, scale, n, chosen, work = _descend(
-                picture, p, start[b], margin_px, noise_floor, max_iterations, table, hidden, work
-            )
-            if status <= 0.0:
+    n_blobs = start.shape[0]
+    out, fits = np.zeros((n_blobs, N_RESULTS)), start.copy()
+    hidden = np.zeros((n_blobs, N_SECTORS), np.bool_)
+    off, sigma = np.zeros((n_blobs, N_SECTORS)), np.zeros((n_blobs, N_SECTORS))
+    sums, extra, work = np.empty((4, N_SECTORS)), np.empty(3), np.empty((N_WORK, 0))
+    for b in range(n_blobs):
+        work = _fit_blob(
+            picture, fits[b], start[b], margin_px, noise_floor, max_iterations, table, hidden[b], off[b], sigma[b],
+            out[b], sums, work,
+        )  # fmt: skip
+    uneven, third = unevenness(off, sigma, out, hidden)
+    for b in range(n_blobs):
+        p, before = fits[b], fits[b].copy()
+        radius = 1.0 / math.sqrt(p[2] * p[4] - p[3] * p[3])
+        skewed = out[b, 17] / radius if radius < SHORT else 0.0
+        while out[b, 15] > 0.0:  # each time more is hidden
+            radius = 1.0 / math.sqrt(p[2] * p[4] - p[3] * p[3])
+            if find_cut(off[b], sigma[b], radius, uneven, third, hidden[b], extra) == 0:
+                out[b, 17] = max(out[b, 17], skewed * radius)
+                add_untold(before, p, extra, out[b])
                 break
-            new = find_hidden(picture, p, hidden, noise_floor, sums)
-            if new == 0:
-                new = find_cut(n, p, chosen, table, work, hidden, 2.0 * noise_floor)
-            if new == 0:
+            if hidden[b].sum() > MOST_HIDDEN:
+                out[b, 14] = 0.0
                 break
-            if hidden.sum() > MOST_HIDDEN:
-                break
-            p[7] = 0.0
-            p[8] = 0.0
-        _finish(p, status, noise_floor, scale, n, chosen, table, hidden, work, out[b])
+            work = _fit_blob(
+                picture, p, start[b], margin_px, noise_floor, max_iterations, table, hidden[b], off[b], sigma[b],
+                out[b], sums, work,
+            )  # fmt: skip
     return out
+
+
+@njit(cache=True, fastmath=True, error_model="numpy")
+def _fit_blob(
+    picture, p, start, margin_px, noise_floor, max_iterations, table, hidden, off, sigma, out, sums, work
+):  # fmt: skip
+    """Fit ``p`` (10,), which it moves, to what is not ``hidden`` (N_SECTORS,) and does not show to be.
+
+    Writes a row ``out`` (N_RESULTS,), and how far the rim is ``off`` by sector (N_SECTORS,) px, with its noise
+    ``sigma``; returns ``work``.
+    """
+    for _ in range(5):
+        p[7] = 0.0
+        p[8] = 0.0
+        status, scale, n, chosen, work = _descend(
+            picture, p, start, margin_px, noise_floor, max_iterations, table, hidden, work
+        )
+        if status <= 0.0:
+            break
+        if find_hidden(picture, p, hidden, noise_floor, sums) == 0:
+            break
+        if hidden.sum() > MOST_HIDDEN:
+            break
+    rim_off(n, p, chosen, table, work, 2.0 * noise_floor, off, sigma)
+    out[:] = 0.0
+    _finish(p.copy(), status, noise_floor, scale, n, chosen, table, hidden, work, out)
+    return work
 
 
 @njit(cache=True, fastmath=True, error_model="numpy")

@@ -8,19 +8,22 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from livedeform.common.types import Array
 from livedeform.stereo_node.detect.blob_fit import fit_blobs, start_parameters
 from livedeform.stereo_node.detect.candidates import find_candidates
 from livedeform.stereo_node.detect.centroid import ink_moments
+from livedeform.stereo_node.detect.cuts import TINY
 from livedeform.stereo_node.detect.picture import Picture, noise_level
 from livedeform.stereo_node.detect.settings import DetectorSettings
 
 MARGIN_PX = (
     4.0  # around the outline; with 3 px the background's slope is less sure and the centre 10 % worse, 5 px cost time
 )
-TINY = 2.25  # px: the radius below which pictures do not tell a chord from a tilt
 CHORD = 3.0  # displacement of the centre of a disc that a chord cuts, per skewness of what is left
+NOISY = 14.0  # variances of a centre: what noise makes of a tiny disc's half axes beside ten others and of its skewness
+NEIGHBOURS = 10  # whose outlines tell what that of a tiny disc should be
 MOST_SKEWED = 0.06  # of the radius: bodies stretch discs less unevenly; of one that is half covered it is 0.07 to 0.2
 
 
@@ -87,7 +90,7 @@ def fit_candidates(picture: Picture, start: Array, settings: DetectorSettings, n
     keep &= ~_twins(fit[:, :2], fit[:, 13] / np.maximum(np.abs(fit[:, 9]), 1e-9), radius, keep)
     covariances = fit[keep][:, [10, 11, 11, 12]].reshape(-1, 2, 2)
     if settings.centre != "moments":
-        covariances = covariances + _untold_cuts(shapes[keep], radius[keep], fit[keep, 17])
+        covariances = covariances + _untold_cuts(fit[keep], shapes[keep], radius[keep])
     return Blobs(
         centres=fit[keep, :2],
         covariances=covariances,
@@ -123,15 +126,47 @@ def _tests(
     }
 
 
-def _untold_cuts(shapes: Array, radius: Array, skewness: Array) -> Array:
+def _untold_cuts(fits: Array, shapes: Array, radius: Array) -> Array:
     """Return (n, 2, 2) px2: where the middles of tiny discs may be if something as light as the ground cuts them.
 
-    What is left is an ellipse, as of a disc that is tilted: its middle may lie off by as much as its half axes differ,
-    and by more where its ``skewness`` (n,) px shows.
+    What is left is an ellipse, as of a disc that is tilted: its middle may lie off by as much as its half axes differ
+    from those of its neighbours on the surface, and by more where its skewness shows, less what noise makes of that.
     """
-    axes = 1 / np.maximum(np.linalg.eigvalsh(shapes), 1e-6)
-    variance = (axes[:, 0] - axes[:, 1]) ** 2 + (CHORD * skewness) ** 2
-    return np.asarray(np.where(radius < TINY, variance, 0.0)[:, None, None] * np.eye(2))
+    out, tiny = np.zeros((len(radius), 2, 2)), np.flatnonzero(radius < TINY)
+    if len(tiny):
+        flattened = _flattened(shapes)
+        own = np.linalg.norm(flattened[tiny] - _of_neighbours(fits[:, :2], flattened, tiny), axis=1)
+        variance = (2.0 * radius[tiny] * np.sinh(own)) ** 2 + (CHORD * fits[tiny, 17]) ** 2
+        variance = np.maximum(variance - NOISY * 0.5 * (fits[tiny, 10] + fits[tiny, 12]), 0.0)
+        out[tiny] = variance[:, None, None] * np.eye(2)
+    return out
+
+
+def _flattened(shapes: Array) -> Array:
+    """Return half the logarithm of the axes' ratio (n, 2) by twice their direction: the same for all discs of a plane
+    that a distant camera sees, whatever their size."""
+    values, vectors = np.linalg.eigh(shapes)
+    size = 0.5 * np.log(np.maximum(values[:, 1], 1e-12) / np.maximum(values[:, 0], 1e-12))
+    angle = 2.0 * np.arctan2(vectors[:, 1, 0], vectors[:, 0, 0])
+    return size[:, None] * np.column_stack([np.cos(angle), np.sin(angle)])
+
+
+def _of_neighbours(centres: Array, flattened: Array, rows: NDArray[np.intp]) -> Array:
+    """Predict what is ``flattened`` (n, 2) at some ``rows`` from their neighbours: linear in the picture, by absolute
+    deviations (iterated weights), since some of them may be cut as well. Of fewer than six nothing (0) is known."""
+    n = min(NEIGHBOURS, len(centres) - 1)
+    if n < 6:
+        return np.zeros((len(rows), 2))
+    near = cKDTree(centres).query(centres[rows], n + 1)[1][:, 1:]
+    away = centres[near] - centres[rows, None]
+    scale = np.linalg.norm(away, axis=2).max(axis=1)[:, None, None]
+    columns = np.concatenate([np.ones((len(rows), n, 1)), away / scale], axis=2)
+    weight, found = np.ones((len(rows), n)), np.zeros((len(rows), 3, 2))
+    for _ in range(10):
+        normal = np.einsum("rni,rn,rnj->rij", columns, weight, columns) + 1e-9 * np.eye(3)
+        found = np.linalg.solve(normal, np.einsum("rni,rn,rnj->rij", columns, weight, flattened[near]))
+        weight = 1.0 / np.maximum(np.linalg.norm(flattened[near] - columns @ found, axis=2), 1e-3)
+    return np.asarray(found[:, 0])
 
 
 def _twins(centres: Array, badness: Array, radius: Array, keep: NDArray[np.bool_]) -> NDArray[np.bool_]:
