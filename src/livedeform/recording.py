@@ -30,6 +30,7 @@ FARTHEST = 20.0  # m from the phantom's origin; beyond it somebody wrote millime
 EARLIEST = 1e8  # s since 1970: before March 1973 it is a time since the recording's start, not a date
 LATEST_NS = 2**31 * 10**9  # a ROS stamp counts seconds since 1970 in a signed number of 32 bits
 LARGEST_FORCE = 1e4  # N
+LARGEST_ID = 2**32 - 1  # that the field id (uint32) holds
 SIDES = {
     "left": (t.LEFT_IMAGE, t.LEFT_CAMERA_INFO, t.FRAME_LEFT),
     "right": (t.RIGHT_IMAGE, t.RIGHT_CAMERA_INFO, t.FRAME_RIGHT),
@@ -65,6 +66,7 @@ class Writer:
         self._T = _rigid(T_phantom_tracker) if T_phantom_tracker is not None else np.eye(4)
         self._bag = BagWriter(path, {"livedeform": livedeform.__version__, "writer": "livedeform.recording"})
         self._writer = RecordingWriter(self._bag)
+        self._closed = False
 
     def points(
         self,
@@ -77,25 +79,22 @@ class Writer:
     ) -> None:
         """Write the markers that were seen at one moment.
 
-        ``ids`` (n,) as in markers.csv; ``points`` (n, 3) m, a row of NaN for a marker that was not seen; ``sigma`` m,
-        one number or (n,), the standard deviation of one coordinate, or ``covariances`` (n, 3, 3) m2, NaN where they
-        are not known. Without either, a diagnosis takes the noise from the recording itself where it can.
-        ``InputError`` for what cannot be meant.
+        ``ids`` (n,) as in markers.csv; ``points`` (n, 3) m, a row of NaN for a marker that was not seen, or none at all
+        where no marker was; ``sigma`` m, one number or (n,), the standard deviation of one coordinate, or
+        ``covariances`` (n, 3, 3) m2, NaN where they are not known. Without either, a diagnosis takes the noise from the
+        recording itself where it can. ``InputError`` for what cannot be meant.
         """
-        where = "Writer.points"
-        places = _shaped(points, (-1, 3), where)
-        numbers = np.asarray(ids)
-        if numbers.shape != (len(places),) or not np.issubdtype(numbers.dtype, np.integer) or (numbers < 0).any():
-            raise InputError(f"{len(places)} points need as many ids, whole numbers >= 0", where=where)
-        if len(np.unique(numbers)) < len(numbers):
-            raise InputError("an id is there twice", where=where, remedy="give every marker its own id")
+        where = self._open("Writer.points")
+        places = _numbers(points, where)
+        places = np.zeros((0, 3)) if places.shape == (0,) else _shaped(places, (-1, 3), where)
+        numbers = _ids(ids, len(places), where)
         seen = np.asarray(np.isfinite(places).all(axis=1))
         _near(places[seen], where)
         spread = _covariances(seen, sigma, covariances)
         R = self._T[:3, :3]
         frame = MarkerFrame(
             self._stamp(seconds, where),
-            numbers[seen].astype(np.uint32),
+            numbers[seen],
             apply(self._T, places[seen]),
             R @ spread[seen] @ R.T,
             np.full(int(seen.sum()), np.nan),
@@ -108,7 +107,7 @@ class Writer:
         ``orientation_xyzw`` (4,) is a unit quaternion. The default turns the probe about x by 180 degrees, so that +z,
         out of the contact face, points down.
         """
-        where = "Writer.pose"
+        where = self._open("Writer.pose")
         place, turn = _shaped(position, (3,), where), _shaped(orientation_xyzw, (4,), where)
         _near(place[None], where)
         if abs(float(np.linalg.norm(turn)) - 1.0) > 1e-3:
@@ -119,7 +118,7 @@ class Writer:
 
     def force(self, seconds: float, force: ArrayLike, torque: ArrayLike = (0.0, 0.0, 0.0)) -> None:
         """Write the force (3,) N of the probe on the phantom and its torque (3,) N m about the frame's origin."""
-        where = "Writer.force"
+        where = self._open("Writer.force")
         F, M = _shaped(force, (3,), where), _shaped(torque, (3,), where)
         if np.linalg.norm(F) > LARGEST_FORCE:
             raise InputError(f"{np.linalg.norm(F):g} N is not plausible", where=where, remedy="give it in newtons")
@@ -133,9 +132,12 @@ class Writer:
 
         Both cameras' pictures of one moment have the same ``seconds``.
         """
-        where = "Writer.picture"
+        where = self._open("Writer.picture")
         topic, _, frame = _side(side, where)
-        pixels = np.asarray(pixels)
+        try:
+            pixels = np.asarray(pixels)
+        except ValueError as error:
+            raise InputError("pixels are no array", where=where, remedy="give uint8 (h, w)") from error
         if pixels.dtype != np.uint8 or pixels.ndim != (2 if encoding == "mono8" else 3):
             what = f"pixels are {pixels.dtype} {pixels.shape} and the encoding is {encoding}"
             raise InputError(what, where=where, remedy="give uint8 (h, w), or (h, w, 3) with encoding='rgb8' or 'bgr8'")
@@ -145,12 +147,17 @@ class Writer:
         """Write one camera's calibration (or that of a ROS camera_calibration file), once before its pictures."""
         from livedeform.stereo_node.camera.calibration_file import read_camera
 
-        _, topic, frame = _side(side, "Writer.camera")
+        where = self._open("Writer.camera")
+        _, topic, frame = _side(side, where)
+        if not isinstance(calibration, CameraCalibration | Path | str):
+            what = f"the calibration is a {type(calibration).__name__}"
+            raise InputError(what, where=where, remedy="give the path of a camera_calibration file")
         known = calibration if isinstance(calibration, CameraCalibration) else read_camera(Path(calibration))
-        self._writer.camera_info(known, self._stamp(seconds, "Writer.camera"), topic, frame)
+        self._writer.camera_info(known, self._stamp(seconds, where), topic, frame)
 
     def close(self) -> None:
-        """End the file; ``with`` does it by itself."""
+        """End the file; ``with`` does it by itself. Whatever is written after that is refused."""
+        self._closed = True
         self._bag.close()
 
     def __enter__(self) -> Self:
@@ -161,7 +168,15 @@ class Writer:
     ) -> None:
         self.close()
 
+    def _open(self, where: str) -> str:
+        if self._closed:
+            remedy = "write before close(), or within the 'with'"
+            raise InputError("the recording is closed: nothing more is written to it", where=where, remedy=remedy)
+        return where
+
     def _stamp(self, seconds: float, where: str) -> int:
+        if np.ndim(seconds) or not isinstance(seconds, int | float | np.number | np.ndarray):
+            raise InputError(f"the time is {seconds!r}, no number", where=where, remedy="give seconds")
         if not np.isfinite(seconds):
             raise InputError(f"the time is {seconds}", where=where, remedy="give seconds")
         if self._start_ns is None and seconds < EARLIEST:
@@ -183,6 +198,9 @@ def _stamp_of(begins: datetime | str) -> int:
         date = datetime.fromisoformat(begins) if isinstance(begins, str) else begins
     except ValueError as error:
         raise InputError(f"'{begins}' is no date", where="begins", remedy="write 2026-03-01 10:30:00") from error
+    if not isinstance(date, datetime):
+        remedy = "write '2026-03-01 10:30:00'; leave it out where seconds are since 1970"
+        raise InputError(f"{begins!r} is no date", where="begins", remedy=remedy)
     date = date if date.tzinfo is not None else date.replace(tzinfo=UTC)
     since = date - datetime(1970, 1, 1, tzinfo=UTC)
     return (since.days * 86_400 + since.seconds) * 1_000_000_000 + since.microseconds * 1000
@@ -193,11 +211,37 @@ def _rigid(value: ArrayLike) -> Array:
     R = T[:3, :3]
     if not (np.allclose(R @ R.T, np.eye(3), atol=1e-6) and np.linalg.det(R) > 0 and np.allclose(T[3], (0, 0, 0, 1))):
         raise InputError("is no rotation with a translation", where="T_phantom_tracker", remedy="metres, no scaling")
+    _near(T[:3, 3], "T_phantom_tracker")
     return T
 
 
+def _numbers(value: ArrayLike, where: str) -> Array:
+    try:
+        return np.asarray(value, float)
+    except (TypeError, ValueError) as error:
+        what = "no array of numbers: a text or nothing is among them, or rows are of different lengths"
+        raise InputError(what, where=where, remedy="give numbers, NaN for what is not known") from error
+
+
+def _ids(ids: Sequence[int] | NDArray[np.integer], n: int, where: str) -> NDArray[np.uint32]:
+    """Return the ids (n,) of as many points."""
+    try:
+        numbers = np.asarray(ids)
+    except ValueError:
+        numbers = np.zeros((0, 0))
+    if numbers.shape == (0,):
+        numbers = numbers.astype(np.int64)
+    if numbers.shape != (n,) or not (np.issubdtype(numbers.dtype, np.integer) or numbers.dtype == object):
+        raise InputError(f"{n} points need as many ids, whole numbers >= 0", where=where)
+    if not all(isinstance(each, int) and 0 <= each <= LARGEST_ID for each in numbers.tolist()):
+        raise InputError(f"ids are whole numbers from 0 to {LARGEST_ID}", where=where, remedy="number the markers anew")
+    if len(np.unique(numbers)) < len(numbers):
+        raise InputError("an id is there twice", where=where, remedy="give every marker its own id")
+    return numbers.astype(np.uint32)
+
+
 def _shaped(value: ArrayLike, shape: tuple[int, ...], where: str) -> Array:
-    array = np.asarray(value, float)
+    array = _numbers(value, where)
     if array.ndim != len(shape) or any(n not in (-1, m) for n, m in zip(shape, array.shape, strict=True)):
         wanted = " x ".join("n" if n == -1 else str(n) for n in shape)
         raise InputError(f"an array of shape {array.shape}, not {wanted}", where=where, remedy="reshape it")
@@ -225,9 +269,14 @@ def _covariances(seen: NDArray[np.bool_], sigma: float | ArrayLike | None, covar
         return given
     if sigma is None:
         return np.full((n, 3, 3), np.nan)
-    each = np.broadcast_to(np.asarray(sigma, float), (n,))
-    if not (each > 0).all():
-        raise InputError("sigma is not positive", where=where, remedy="give it in metres, or leave it out")
+    each = _numbers(sigma, where)
+    if each.shape not in ((), (n,)):
+        remedy = "give one number or one for each point"
+        raise InputError(f"{n} points, and sigma is an array of shape {each.shape}", where=where, remedy=remedy)
+    each = np.broadcast_to(each, (n,))
+    if not ((each > 0) & (each < np.inf) | np.isnan(each)).all():
+        remedy = "give it in metres, NaN where it is not known, or leave it out"
+        raise InputError("sigma is not positive", where=where, remedy=remedy)
     return np.asarray(each[:, None, None] ** 2 * np.eye(3))
 
 

@@ -104,6 +104,18 @@ def test_a_recording_without_a_force_leaves_the_others_theirs(missing: str) -> N
     assert values_of(found)["stiffness"] == pytest.approx(0.8, rel=0.02)  # measured 0.0016
 
 
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_forces_that_are_not_those_of_the_model_are_a_doubt(sign: float) -> None:
+    """Of the force on the probe for that on the phantom it was said that what is left is within the noise (p = 1, chi2
+    per datum 3.5): no black box looks at forces."""
+    fit, test = (measured([], s, n, name, forces=True) for s, n, name in ((3, 36, "fit"), (1003, 24, "test")))
+    turned = [replace(o, forces=None if o.forces is None else sign * o.forces) for o in (fit, test)]
+    found = investigate(WithForce(BODY), toy_inputs(*turned, NAMES))
+    said = [doubt for doubt in found.doubts if doubt.startswith("the measured forces are not those of the model")]
+    assert len(said) == (sign < 0.0)
+    assert 0.7 < found.discrepancy.chi2 < 1.3  # of the markers alone: measured 0.95
+
+
 @pytest.mark.parametrize("ratio", [1.0, 1.2])
 @pytest.mark.parametrize("seed", [0, 2])
 def test_points_that_the_tracker_states_to_be_poor_make_nothing_up(seed: int, ratio: float) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from livedeform.fem_node.element.element import make_space
@@ -15,9 +17,16 @@ EXACT = SolverSettings(tolerance=1e-12)
 NO_GRAVITY = np.zeros(3)
 
 
-def plane(axis, value, tolerance=1e-6):
-    """The region of points with x[axis] = value."""
-    return lambda X: np.abs(X[:, axis] - value) < tolerance
+@dataclass(frozen=True)
+class plane:
+    """The region of points with x[axis] = value; by what it is, as an experiment's regions are, solutions are kept."""
+
+    axis: int
+    value: float
+    tolerance: float = 1e-6
+
+    def __call__(self, X):
+        return np.abs(X[:, self.axis] - self.value) < self.tolerance
 
 
 def symmetry(*axes):

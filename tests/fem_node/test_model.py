@@ -199,6 +199,20 @@ def test_the_loop_s_body_rests_where_its_recording_begins(space, fraction, chang
     np.testing.assert_allclose(rest, first, atol=1e-9)  # measured 1.2e-11 m
 
 
+@pytest.mark.parametrize("loads", [(), (DeadLoad("w", plane(2, HEIGHT), np.array([0.0, 0.0, -0.05])),)])
+@pytest.mark.parametrize("ms", [[0, 250, 300, 600], [0, 250], [0, 200, 300]])
+def test_the_loop_s_body_falls_where_a_frame_is_taken_as_it_is_let_go(space, ms, loads):
+    """Its rest of that stamp was given back for the loaded body, which never moved (0.0 mm of 22.5)."""
+    physics, stamps = _physics(release=0.25, loads=loads), [round(1e6 * t) for t in ms]
+    simulator = Simulator(space.mesh, "p2p0", MARKERS, np.array([False, False, False, True]))
+    cold = _model(space, release=0.25, loads=loads).simulate(None, stamps, start_ns=0).predictions
+    for _ in range(2):  # the second knows what the first has solved
+        found = simulator.simulate(physics, Recorded("a", stamps, 0, ()), (), WALK).predictions
+        for one, other in zip(found, cold, strict=True):
+            np.testing.assert_allclose(one.markers, other.markers, atol=1e-8)
+    assert np.abs(cold[-1].markers - MARKERS).max() > 1e-4
+
+
 def test_a_released_body_with_inertia_overshoots(space):
     model = _model(space, release=0.0, inertia=Inertia(0.001))
     model.reset(start_ns=0)

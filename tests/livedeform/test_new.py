@@ -102,7 +102,9 @@ def test_without_a_terminal_every_missing_option_is_named_at_once(block: Path) -
         ({"element_size": "1e-5"}, "--element-size: .* tetrahedra"),
         ({"friction": "20"}, "--friction: 20 is not plausible"),
         ({"probe": "cylinder:0.01,0.1", "edge_radius": "0.2"}, "--edge-radius: "),
-        ({"probe": "ball:2"}, "--probe: sphere is 2 m"),
+        ({"probe": "ball:2"}, "--probe: sphere is 2 m; write ball:0.002 if millimetres are meant"),
+        ({"probe": "box:20,15,40"}, "--probe: box is 40 m; write box:0.02,0.015,0.04 if"),
+        ({"probe": "ball"}, r"--probe: .*ball:0\.01"),
         ({"threshold": "2"}, "--threshold: error is 2 m"),
     ],
 )
@@ -111,6 +113,26 @@ def test_a_wrong_answer_is_one_line(block: Path, change: dict[str, str], said: s
         make_experiment(block / "new", sources(block), KNOWN | change)
     assert "\n" not in str(caught.value) and caught.value.remedy and "draft" not in str(caught.value)
     assert not (block / "new").exists()
+
+
+@pytest.mark.parametrize(
+    ("head", "separator", "said"),
+    [
+        ("id,x,y,z", ";", "separated by ';': put commas between them, and points into decimals"),
+        ("id,x,y,z", "\t", "separated by tabs: put commas"),
+        ("id,x [mm],y [mm],z [mm]", ",", "call the columns id,x,y,z, .* with --markers-unit mm"),
+        ("id,X(mm),Y(mm),Z(mm)", ",", "with --markers-unit mm"),
+        ("id,x_mm,y_mm,z_mm", ",", "with --markers-unit mm"),
+        ("id,x [m],y [m],z [m]", ",", "without their unit: lengths are in metres$"),
+        ("name,a,b,c", ",", "begin the file with the line id,x,y,z"),
+    ],
+)
+def test_a_table_with_another_head_says_what_to_change(block: Path, head: str, separator: str, said: str) -> None:
+    rows = [head, "1,0,0,50", "2,30,0,25", "3,0,30,25", "4,-30,0,25"]
+    (block / "other.csv").write_text("\n".join(row.replace(",", separator) for row in rows))
+    with pytest.raises(InputError, match=said) as caught:
+        make_experiment(block / "new", sources(block, "other.csv"), KNOWN)
+    assert "other.csv: column " in str(caught.value) and not (block / "new").exists()
 
 
 def test_what_is_made_is_as_sound_as_info_says(block: Path) -> None:

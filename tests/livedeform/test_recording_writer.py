@@ -14,6 +14,7 @@ from livedeform.common.frames import transform
 from livedeform.recording import Writer
 
 POINTS = np.array([[0.01, 0.0, 0.05], [0.0, 0.02, 0.05], [np.nan, 0.0, 0.0]])
+LARGEST = 2**32 - 1
 MARCH = 1_772_361_000 * 10**9  # 2026-03-01 10:30 UTC
 
 
@@ -65,6 +66,26 @@ def write(tmp_path: Path, what: str, *arguments: object, **options: object) -> N
         ("points", (0.0, [1.5], np.zeros((1, 3))), {}, "whole numbers"),
         ("points", (0.0, [1], [0.0, 0.0, 0.0]), {}, "not n x 3"),
         ("points", (0.0, [1], np.zeros((1, 3))), {"sigma": 0.0}, "sigma is not positive"),
+        ("points", (0.0, [1], np.zeros((1, 3))), {"sigma": [float("inf")]}, "sigma is not positive"),
+        ("points", (0.0, [1, 2], np.zeros((2, 3))), {"sigma": [1e-4] * 3}, r"2 points, and sigma is .* shape \(3,\)"),
+        ("points", (0.0, [1, 2], np.zeros((2, 3))), {"sigma": np.ones((2, 3))}, r"shape \(2, 3\)"),
+        ("points", (0.0, [1], np.zeros((1, 3))), {"sigma": "fine"}, "no array of numbers"),
+        ("points", (0.0, [2**32], np.zeros((1, 3))), {}, "from 0 to 4294967295"),
+        ("points", (0.0, [2**32 + 5, 5], np.zeros((2, 3))), {}, "from 0 to 4294967295"),
+        ("points", (0.0, [2**70], np.zeros((1, 3))), {}, "from 0 to 4294967295"),
+        ("points", (0.0, [-1], np.zeros((1, 3))), {}, "from 0 to 4294967295"),
+        ("points", (0.0, ["A"], np.zeros((1, 3))), {}, "whole numbers"),
+        ("points", (0.0, [[1], [1, 2]], np.zeros((2, 3))), {}, "whole numbers"),
+        ("points", (0.0, [1], []), {}, "0 points need as many ids"),
+        ("points", (0.0, [1, 2], [[0.0, 0.0, 0.0], [0.0, 0.0]]), {}, "rows are of different lengths"),
+        ("points", (0.0, [1], [["a", "b", "c"]]), {}, "a text or nothing is among them"),
+        ("points", (0.0, [1], None), {}, "not n x 3"),
+        ("points", (0.0, [1], np.zeros((1, 3))), {"covariances": "none"}, "no array of numbers"),
+        ("pose", (0.0, "here"), {}, "no array of numbers"),
+        ("pose", ("0.1", [0.0, 0.0, 0.0]), {}, "the time is '0.1', no number; give seconds"),
+        ("pose", (None, [0.0, 0.0, 0.0]), {}, "the time is None, no number"),
+        ("pose", ([0.1], [0.0, 0.0, 0.0]), {}, r"the time is \[0.1\], no number"),
+        ("camera", ("left", 0.0, 5), {}, "the calibration is a int"),
         ("pose", (0.0, [0.0, 0.0, 0.0], [1.0, 1.0, 0.0, 0.0]), {}, "norm"),
         ("pose", (float("nan"), [0.0, 0.0, 0.0]), {}, "give seconds"),
         ("force", (0.0, [0.0, 0.0, -1e5]), {}, "newtons"),
@@ -105,3 +126,45 @@ def test_a_time_that_no_stamp_holds_is_one_line(tmp_path: Path, second: float, b
             with pytest.raises(InputError, match=r"Writer\..*is no time of a stamp; give seconds \(not milli"):
                 write()
     assert len(load_recording(tmp_path / "a.mcap").marker_frames) == 1
+
+
+@pytest.mark.parametrize("begins", [1772447400.0, 5, True])
+def test_a_beginning_that_is_no_date_is_one_line(tmp_path: Path, begins: object) -> None:
+    with pytest.raises(InputError, match=f"begins: {begins} is no date; .*since 1970"):
+        Writer(tmp_path / "a.mcap", begins=begins)  # type: ignore[arg-type]
+    assert not (tmp_path / "a.mcap").exists()
+
+
+def test_a_trackers_frame_in_millimetres_is_one_line(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"T_phantom_tracker: a coordinate of 250 m .*give metres"):
+        Writer(tmp_path / "a.mcap", T_phantom_tracker=transform(np.eye(3), np.array([250.0, 0.0, 0.0])))
+
+
+def test_nothing_is_written_after_the_end(tmp_path: Path) -> None:
+    """It was accepted, and lost."""
+    with Writer(tmp_path / "a.mcap", begins="2026-03-01") as recording:
+        recording.pose(0.0, [0.0, 0.0, 0.1])
+    recording.close()
+    for write in (
+        lambda: recording.points(1.0, [1], POINTS[:1]),
+        lambda: recording.pose(1.0, [0.0, 0.0, 0.1]),
+        lambda: recording.force(1.0, [0.0, 0.0, 0.1]),
+        lambda: recording.picture("left", 1.0, np.zeros((4, 6), np.uint8)),
+        lambda: recording.camera("left", 1.0, tmp_path / "left.yaml"),
+    ):
+        with pytest.raises(InputError, match=r"Writer\..*the recording is closed: .*; write before close"):
+            write()
+    assert len(load_recording(tmp_path / "a.mcap").poses) == 1
+
+
+def test_a_moment_without_a_marker_is_a_frame(tmp_path: Path) -> None:
+    nothing = [([], []), ([], np.zeros((0, 3))), (np.zeros(0, int), []), ([3], [[np.nan] * 3])]
+    with Writer(tmp_path / "a.mcap", begins="2026-03-01") as recording:
+        for second, (ids, points) in enumerate(nothing):
+            recording.points(float(second), ids, points)
+        recording.points(9.0, [], [], sigma=1e-4)
+        recording.points(10.0, [LARGEST, 0], POINTS[:2], sigma=[1e-4, np.nan])
+        recording.points(np.float32(11.0), [5, 6], [[0.0, 0.0, 0.0], [np.nan] * 3], sigma=[1e-4, np.nan])
+    frames = load_recording(tmp_path / "a.mcap").marker_frames
+    assert [frame.ids.tolist() for frame in frames] == [[]] * 5 + [[LARGEST, 0], [5]]
+    assert np.isnan(frames[5].covariances[1]).all() and frames[6].covariances[0, 0, 0] == pytest.approx(1e-8)

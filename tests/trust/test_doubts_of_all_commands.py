@@ -11,7 +11,7 @@ import pytest
 import yaml
 from situations import small
 
-from livedeform.closed_loop.inputs import _force_doubts
+from livedeform.closed_loop.inputs import _recorded_doubts
 from livedeform.common import topics as t
 from livedeform.common.bags.read import read_bag
 from livedeform.common.bags.recording import load_recording
@@ -92,6 +92,11 @@ def one_id_twice(sent: Sent) -> Sent:
     return replace(sent, frame=replace(sent.frame, ids=np.where(IDS == 4, np.uint32(3), IDS)))
 
 
+def ids_exchanged(sent: Sent) -> Sent:
+    exchanged = np.choose(np.isin(IDS, (3, 4)) & (sent.at > 4.0), [IDS, 7 - IDS]).astype(np.uint32)
+    return replace(sent, frame=replace(sent.frame, ids=exchanged))
+
+
 def clock_set(sent: Sent) -> Sent:
     return replace(sent, ahead=0.25 * (sent.at > 1.0))
 
@@ -109,6 +114,7 @@ def cameras_moved(sent: Sent) -> Sent:
 DOUBTS: dict[str, tuple[Change, str]] = {
     "the wrench was not tared": (untared, "the wrench is not tared: (0.00, 0.00, -1.50) N while the probe is in the"),
     "one id for two markers": (one_id_twice, "markers whose id is there twice in a frame are left out"),
+    "two markers exchange their ids": (ids_exchanged, "markers exchange their ids: 3 and 4 at 4.0"),
     "the tracker's clock was set": (clock_set, "receive time minus stamp of /stereo/markers changes by 0.250 s beside"),
     "the force sensor's clock was set": (force_clock_set, "receive time minus stamp of /probe/wrench changes by 0.250"),
     "the cameras were registered anew": (cameras_moved, "/tf_static says anew where the cameras are"),
@@ -130,10 +136,11 @@ def test_a_doubt_is_said_by_every_command(name: str, tmp_path: Path, experiment:
     assert found in inspect(bag, tmp_path / "experiment").findings
     (loaded,) = load_checked([bag], [], experiment)
     assert found.text in loaded.warnings
-    of_forces = [found.text] if change in (untared, force_clock_set) else []
-    assert found.of_forces == bool(of_forces) and loaded.force_doubts == of_forces
-    assert doubts_of([found]) == (() if of_forces else (found.text,))  # a run reads no force that was measured
-    assert _force_doubts({"x": loaded}) == [f"x: {text}" for text in of_forces]  # which a diagnosis reads
+    assert found.of_forces == (change in (untared, force_clock_set))
+    assert doubts_of([found]) == (() if found.of_forces else (found.text,))  # a run reads no force that was measured
+    assert found.mended == (change is ids_exchanged)  # a diagnosis leaves them out itself, and reads forces
+    assert loaded.doubts == ([] if found.mended else [found.text])
+    assert _recorded_doubts({"x": loaded, "y": loaded}) == [f"x, y: {text}" for text in loaded.doubts]
 
 
 def test_of_a_sound_recording_nothing_is_in_doubt(tmp_path: Path, experiment: Experiment) -> None:

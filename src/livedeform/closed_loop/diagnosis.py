@@ -22,7 +22,7 @@ from livedeform.closed_loop.assessment.held_out import (
 )
 from livedeform.closed_loop.assessment.next_experiment import Proposal
 from livedeform.closed_loop.assessment.ranking import Ranked
-from livedeform.closed_loop.assessment.verdict import Conclusion, Verdict, headline, rivals_of
+from livedeform.closed_loop.assessment.verdict import Conclusion, Verdict, headline, rivals_of, share_of_evidence
 from livedeform.closed_loop.candidates import all_effects, doubt, that_stay
 from livedeform.closed_loop.evidence.measuring_noise import Source
 from livedeform.closed_loop.evidence.observation import Observation, are_pressed, are_untouched
@@ -243,7 +243,8 @@ def steady_notes(after: HeldOutErrors, places: Array, settings: VerdictSettings)
     much) contradicts the model, whatever the body does."""
     said, known = [], 1e3 * float(np.median(places))
     for r in after.recordings:
-        _, steady, whole = _steady(r)
+        mean, seen, whole = _steady(r)
+        steady = _rms(mean, seen)
         if steady > settings.there_always * whole:
             said.append(
                 f"{r.name}: {1e3 * steady:.3f} mm of the {1e3 * whole:.3f} mm that are left are there all the time, as "
@@ -276,13 +277,13 @@ def registration_reasons(after: HeldOutErrors, inputs: Inputs) -> list[str]:
     that is allowed for, and so it is evidence for nothing."""
     said, uncertain, settings = [], inputs.uncertain, inputs.settings.verdict
     for r in after.recordings:
-        mean, _, whole = _steady(r)
-        seen = np.isfinite(mean).all(axis=1)
-        if seen.sum() < 3:
+        mean, seen, whole = _steady(r)
+        if (seen > 0.0).sum() < 3:
             continue
-        at = inputs.places[seen]
-        moved = frames.apply(frames.fit_rigid(at, at + mean[seen]), at) - at
-        rigid = float(np.sqrt(np.mean(np.sum(moved**2, axis=1))))
+        at, mean, seen = inputs.places[seen > 0.0], mean[seen > 0.0], seen[seen > 0.0]
+        rest = at + mean - frames.apply(frames.fit_rigid(at, at + mean, seen), at)
+        # what it takes away: one that turns by much is larger than that
+        rigid = float(np.sqrt(max(_rms(mean, seen) ** 2 - _rms(rest, seen) ** 2, 0.0)))
         if rigid > settings.there_always * whole:
             said.append(
                 f"{r.name}: {1e3 * rigid:.3f} mm of the {1e3 * whole:.3f} mm that are left are one rigid motion of all "
@@ -293,14 +294,20 @@ def registration_reasons(after: HeldOutErrors, inputs: Inputs) -> list[str]:
     return said
 
 
-def _steady(r: RecordingErrors) -> tuple[Array, float, float]:
-    """Find each marker's mean error (m, 3) m, NaN where never seen; its rms and that of the whole error, m."""
+def _steady(r: RecordingErrors) -> tuple[Array, Array, float]:
+    """Find each marker's mean error (m, 3) m, NaN where never seen, the time (m,) s for which it was, and the rms of
+    the whole error, m."""
     error = r.measured - r.predicted
-    weights = np.where(np.isfinite(error), r.weights[:, None, None], 0.0)
+    weights = np.where(np.isfinite(error).all(axis=2), r.weights[:, None], 0.0)
     total = weights.sum(axis=0)
-    mean = np.sum(weights * np.nan_to_num(error), axis=0) / np.where(total > 0.0, total, np.nan)
-    whole = float(np.sqrt(np.nansum(weights * error**2) / (weights.sum() / 3.0)))
-    return mean, float(np.sqrt(np.nanmean(np.sum(mean**2, axis=1)))), whole
+    mean = np.einsum("km,kmi->mi", weights, np.nan_to_num(error)) / np.where(total > 0.0, total, np.nan)[:, None]
+    whole = float(np.sqrt(np.sum(weights * np.sum(np.nan_to_num(error) ** 2, axis=2)) / weights.sum()))
+    return mean, total, whole
+
+
+def _rms(vectors: Array, weights: Array) -> float:
+    """Return the rms of ``vectors`` (m, 3) where they have ``weights`` (m,)."""
+    return float(np.sqrt(weights @ np.sum(np.nan_to_num(vectors) ** 2, axis=1) / weights.sum()))
 
 
 def chi2_notes(chi2: float, settings: VerdictSettings) -> list[str]:
@@ -473,13 +480,28 @@ def in_their_place(model: FittedModel, covariance: Array | None) -> str:
     return " ".join(said)
 
 
-def left_doubts(conclusion: Conclusion, left: Discrepancy) -> tuple[str, ...]:
-    """Say that something is left beside the effects that are given as the cause, which may stand for what it is."""
-    if conclusion.verdict != "effect" or not conclusion.loud:
+def left_doubts(conclusion: Conclusion, left: Discrepancy, settings: VerdictSettings) -> tuple[str, ...]:
+    """Say that something is left beside the effects that are given as the cause, which may stand for what it is: too
+    much, or most of what there was to explain, however little."""
+    if conclusion.verdict != "effect":
+        return ()
+    share = "" if conclusion.loud else f"; {share_of_evidence(conclusion.explained)} % are explained"
+    least = left.p_value < settings.p_value and conclusion.explained < settings.min_explained
+    if not conclusion.loud and not least:
         return ()
     return (
         f"{1e3 * left.excess:.3f} mm rms are left beside the added effects, beyond noise (chi2 per datum "
-        f"{left.chi2:.2f}): they are not the whole cause, or stand for another one",
+        f"{left.chi2:.2f}{share}): they are not the whole cause, or stand for another one",
+    )
+
+
+def force_doubts(left: Discrepancy, settings: VerdictSettings) -> tuple[str, ...]:
+    """Say that the forces are not those of the model: what is left of the markers does not tell it."""
+    if not left.chi2_forces > settings.usual_chi2[1]:
+        return ()
+    return (
+        f"the measured forces are not those of the model (chi2 per datum {left.chi2_forces:.3g} of {left.n_forces}): "
+        "check their sign, frame, unit and zero, and the declared modulus",
     )
 
 

@@ -120,13 +120,17 @@ def read_inputs(
         recordings=recordings,
         declared=tuple(experiment.effects),
         settings=settings,
-        doubts=(*_force_doubts(recordings), *doubts),
+        doubts=(*_recorded_doubts(recordings), *doubts),
     )
 
 
-def _force_doubts(recordings: Mapping[str, Recording]) -> list[str]:
-    """Say why forces of the recordings, which are fitted, may be wrong."""
-    return [f"{name}: {text}" for name, recording in recordings.items() for text in recording.force_doubts]
+def _recorded_doubts(recordings: Mapping[str, Recording]) -> list[str]:
+    """Say why what was recorded may be wrong; what is said of all recordings, once."""
+    said: dict[str, list[str]] = {}
+    for name, recording in recordings.items():
+        for text in dict.fromkeys(recording.doubts):
+            said.setdefault(text, []).append(name)
+    return [f"{', '.join(names)}: {text}" for text, names in said.items()]
 
 
 def _load(

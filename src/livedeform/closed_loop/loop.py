@@ -53,6 +53,7 @@ from livedeform.closed_loop.diagnosis import (
     elements_notes,
     fit_notes,
     floor_notes,
+    force_doubts,
     held_out_notes,
     left_doubts,
     lost_doubts,
@@ -407,5 +408,6 @@ def _doubts(assessed: Assessed, given: HeldOutRuns, settings: VerdictSettings) -
         *fit_notes(assessed.tested.model.joint, assessed.found.problem, settings),
         *cut_off_doubts(assessed.found),
         *lost_doubts(assessed.found, assessed.tested.model),
-        *left_doubts(assessed.conclusion, assessed.left),
+        *left_doubts(assessed.conclusion, assessed.left, settings),
+        *force_doubts(assessed.left, settings),
     )

@@ -119,6 +119,10 @@ class NoiseSettings:
     clear_level: float = _effort(0.15, "1", "share of the largest motion that is to be seen through the noise")
     clear_sigmas: float = _effort(5.0, "1", "of the noise, beyond which motion is no noise")
     least_wrenches: int = _effort(5, "1", "wrenches that make a course of the force")
+    jitter: float = _effort(2.0, "sigma of the recorded path", "beyond which a probe is not still")
+    whole: tuple[float, float, int] = _effort(
+        (0.9, 0.1, 6), "1, 1, 1", "of differences, that share is so near to multiples of so many parts of a small one"
+    )
 
 
 @dataclass(frozen=True)

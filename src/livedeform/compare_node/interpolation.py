@@ -92,7 +92,8 @@ class InterpolationBound:
         """Return what is known of all frames so far."""
         if not np.isfinite(self.value):
             return Interpolated()
-        p95 = float(EDGES[min(np.searchsorted(np.cumsum(self._classes), 0.95 * self._n), len(EDGES) - 1)])
+        at = int(np.searchsorted(np.cumsum(self._classes), 0.95 * self._n))
+        p95 = float(EDGES[min(at, len(EDGES) - 1)])
         rare = self._classes[0] >= 0.95 * self._n
         return Interpolated(self.value, max(float(np.sqrt(self._squares / self._n)), 0.0 if rare else p95))
 

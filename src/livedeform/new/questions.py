@@ -14,7 +14,8 @@ from livedeform.new.body import NewBody
 Ask = Callable[[str, str | None], str]  # (question, default) -> the answer as it was typed
 
 PROBES = {"ball": ("sphere", 1), "cylinder": ("cylinder", 2), "box": ("box", 3)}
-PROBE_REMEDY = "write ball:R, cylinder:R,H or box:L,W,H in metres, mesh:FILE, or none"
+METRE = 1.0  # m; no probe is as large as that, in millimetres many are
+PROBE_REMEDY = "write ball:R, cylinder:R,H or box:L,W,H in metres (ball:0.01), mesh:FILE, or none"
 
 
 @dataclass(frozen=True)
@@ -145,6 +146,9 @@ def read_probe(text: str) -> dict[str, Any] | None:
     numbers = [_positive(size) for size in sizes.split(",")]
     if len(numbers) != n:
         raise InputError(f"a {kind} has {n} sizes, not {len(numbers)}", remedy=PROBE_REMEDY)
+    if max(numbers) >= METRE:
+        meant = ",".join(f"{1e-3 * number:g}" for number in numbers)
+        raise InputError(f"{key} is {max(numbers):g} m", remedy=f"write {kind}:{meant} if millimetres are meant")
     return {key: numbers[0] if n == 1 else numbers}
 
 

@@ -29,9 +29,10 @@ FLAT, STILL, NOTHING = 1e-6, 1e-12, 1e-30  # m of height, and least deviations t
 @dataclass(frozen=True)
 class Discrepancy:
     """``p_value`` of the residual under noise alone; ``gain``: twice the log evidence for the black box; ``excess``
-    m, rms of the smooth part beyond noise, ``chi2`` per degree of freedom of the whitened residual; ``smooth`` (k, m,
+    m, rms of the smooth part beyond noise, ``chi2`` per datum of the markers' whitened residual; ``smooth`` (k, m,
     3) m: the black box's estimate of what is left, or the residual's own part of its functions where that is less, zero
-    where nothing was ``seen`` (k, m) bool. All sizes are of what was seen."""
+    where nothing was ``seen`` (k, m) bool. All sizes are of what was seen. ``chi2_forces``: per datum of the
+    ``n_forces`` components of forces, of which the black box knows nothing; NaN without any."""
 
     p_value: float
     gain: float
@@ -39,6 +40,8 @@ class Discrepancy:
     chi2: float
     smooth: Array
     seen: np.ndarray
+    chi2_forces: float = float("nan")
+    n_forces: int = 0
 
     def rms(self, axis: int | None = None) -> Array:
         """Return the rms m of the smooth part where it was seen: of all, or over the moments (0) or markers (1)."""
@@ -108,7 +111,13 @@ def discrepancy(
     smooth = min(found, there, key=lambda field: float(_rms(field, seen)))
     p_value = tail_probability(float(evidence.max()), null_best, settings.screening.tail)
     excess = float(_rms(smooth, seen))
-    return Discrepancy(p_value, float(evidence.max()), excess, float(r @ r) / len(r), smooth, seen)
+    chi2, of_forces = _mean_square(r[points]), _mean_square(r[~points])
+    return Discrepancy(p_value, float(evidence.max()), excess, chi2, smooth, seen, of_forces, int(np.sum(~points)))
+
+
+def _mean_square(x: Array) -> float:
+    """Return the mean of the squares of ``x`` (n,); NaN of none."""
+    return float(x @ x) / len(x) if len(x) else float("nan")
 
 
 def _there(problem: Problem, basis: Array) -> Array:

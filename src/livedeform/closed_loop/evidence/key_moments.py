@@ -7,15 +7,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from livedeform.closed_loop.evidence.measuring_noise import (
-    DIFFERENCES,
-    MAD_PER_SIGMA,
-    TINY,
-    MarkerMotion,
-    NoiseReport,
-    median,
-    zeros,
-)
+from livedeform.closed_loop.evidence.force_noise import ForceNoise, noise_of_force
+from livedeform.closed_loop.evidence.measuring_noise import MarkerMotion, NoiseReport, median, zeros
 from livedeform.closed_loop.evidence.track import Track
 from livedeform.closed_loop.settings import NoiseSettings, SamplingSettings, Settings
 from livedeform.common.checks.recorded import POSES_APART_NS
@@ -104,11 +97,13 @@ def forces_at(
     sigma: float,
     settings: Settings,
     path: PosePath | None = None,
-) -> tuple[Array | None, float]:
+) -> tuple[Array | None, ForceNoise]:
     """Forces (k, 3) N at the key moments, NaN where wrenches are as far apart as poses that are not interpolated, and
-    their sigma from the record itself (`force_noise`), with the probe's ``path``; None where there are too few."""
+    their noise, of a given ``sigma`` N or from the record itself (`noise_of_force`), with the probe's ``path``; None
+    where there are too few."""
+    given = ForceNoise(sigma)
     if len(wrenches) < settings.noise.least_wrenches:
-        return None, sigma
+        return None, given
     wrenches = sorted(wrenches, key=lambda w: w.stamp_ns)
     at = np.array([w.stamp_ns for w in wrenches])
     force, times = np.array([w.force for w in wrenches]), (at - start_ns) * 1e-9
@@ -123,34 +118,8 @@ def forces_at(
             near = _apart_at(times, here) <= 1e-9 * POSES_APART_NS
             out[k] = [np.interp(here, times, force[:, i]) for i in range(3)] if near else np.nan
     if not np.isfinite(out).any():
-        return None, sigma
-    return out, sigma if np.isfinite(sigma) else force_noise(force, times, place, settings)
-
-
-def force_noise(force: Array, times: Array, place: Array, settings: Settings) -> float:
-    """Estimate the sigma (N) of ``force`` (w, 3) N at ``times`` (w,) s with the probe at ``place`` (w, 3) m, by second
-    differences over as many samples as it takes until they grow no more: a sensor's filter, or samples that are sent
-    several times, keep neighbours alike. Between neighbours all differences count, over more those of a still probe."""
-    most = settings.noise.window / max(float(np.median(np.diff(times))), TINY)
-    all_of_them = _force_variance(force, np.zeros_like(place), 1, settings)
-    lag, variance = 1, _force_variance(force, place, 1, settings)
-    while 2 * lag <= most:
-        lag, before, variance = 2 * lag, variance, max(variance, _force_variance(force, place, 2 * lag, settings))
-        if 0.0 < variance < (1.0 + settings.noise.uncorrelated) * before:
-            break
-    return max(float(np.sqrt(max(variance, all_of_them))), settings.noise.force_sigma)
-
-
-def _force_variance(force: Array, place: Array, lag: int, settings: Settings) -> float:
-    """Return the variance N2 of ``force`` (w, 3) by second differences over ``lag`` samples between which the probe, at
-    ``place`` (w, 3) m, hardly moved; 0 where there are too few of these."""
-    first, last = slice(None, -2 * lag), slice(2 * lag, None)
-    moved = [np.linalg.norm(place[part] - place[lag:-lag], axis=1) for part in (first, last)]
-    still = np.maximum(*moved) <= settings.sampling.window_motion
-    d = (force[first] - 2.0 * force[lag:-lag] + force[last])[still]
-    if len(d) < (settings.noise.enough if lag > 1 else 1):
-        return 0.0
-    return float(np.median(np.abs(d)) / MAD_PER_SIGMA) ** 2 / DIFFERENCES
+        return None, given
+    return out, given if np.isfinite(sigma) else noise_of_force(force, times, place, settings)
 
 
 def _apart_at(times: Array, t: float) -> float:

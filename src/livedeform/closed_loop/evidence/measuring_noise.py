@@ -6,13 +6,14 @@ not tell it, it is what the tracker states, or else second differences in time o
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
 from scipy.optimize import nnls
 from scipy.special import stdtrit
 
+from livedeform.closed_loop.evidence.rounding import of_rounding, steps_of, that_lasts
 from livedeform.closed_loop.evidence.shared_motion import Unshared, lagged, unshared
 from livedeform.closed_loop.evidence.track import Track
 from livedeform.closed_loop.settings import NoiseSettings
@@ -38,7 +39,9 @@ class NoiseReport:
     = n / n_effective of the mean of a window of frames; ``n_differences`` second differences there are. ``source``:
     where the size comes from, and whether it was ``measured``; ``value`` m, Euclidean sigma of a point as that source
     has it, with its 95 % ``interval`` m, from ``n`` points (NaN and 0 where it was not measured); ``ratio`` of the
-    measured to the stated variance (NaN: one of them is missing).
+    measured to the stated variance (NaN: one of them is missing). Values are written in ``steps`` (3,) m, 0 along axes
+    where that is not seen; ``kept`` is what was stated, or where nothing was what is seen from frame to frame, over
+    the ``covariance`` that rounding makes of it (1 where it makes nothing).
     """
 
     covariance: Array
@@ -51,6 +54,8 @@ class NoiseReport:
     interval: tuple[float, float] = (float("nan"), float("nan"))
     n: int = 0
     ratio: float = float("nan")
+    steps: Array = field(default_factory=lambda: np.zeros(3))
+    kept: float = 1.0
 
     @property
     def measured(self) -> bool:
@@ -59,9 +64,10 @@ class NoiseReport:
 
     @property
     def repeated(self) -> float:
-        """The share of the covariance that repeats show; the rest is an error that lasts, as of a dot's shape."""
+        """The share of the covariance that repeats show; the rest is an error that lasts, as of a dot's shape, or of
+        rounding."""
         seen = self.ratio if np.isfinite(self.ratio) else self.scale
-        return min(seen, 1.0) if np.isfinite(seen) else 1.0
+        return min(seen * self.kept, 1.0) if np.isfinite(seen) else self.kept
 
 
 @dataclass(frozen=True)
@@ -83,25 +89,30 @@ def noise_of(data: Track, settings: NoiseSettings) -> NoiseReport:
     One factor, not below one, scales the stated covariances: a tracker knows its anisotropy better than a recording
     does, and what repeats do not show, a systematic part, may be stated with reason.
     """
+    steps = _steps(data, settings)
     lag = _changing_lag(data, settings)
     d, seen = _second_differences(data, lag, settings.least_frames)
     quiet = _quiet_differences(data, seen, lag, settings)
     measured = _from_unshared(data, settings)
-    covariance, source = _without_statement(measured, d, quiet, settings)
+    shown, source = _without_statement(measured, d, quiet, steps, settings)
     stated, has_stated = _stated(data, settings)
     scale = ratio = float("nan")
+    covariance = shown
     if has_stated:
-        stated = _in_all_directions(stated, covariance)
-        scale = _scale(d, data, stated, quiet, lag, covariance) if quiet.sum() >= settings.enough else 1.0
+        stated = _in_all_directions(stated, shown)
+        scale = _scale(d, data, stated, quiet, lag, shown, steps, settings) if quiet.sum() >= settings.enough else 1.0
         if measured is not None:
             ratio = float(measured.value**2 / _size(stated, data) ** 2)
         covariance, source = stated * max(ratio if measured else 1.0, 1.0), "stated"
+    rounded = _with_rounding(covariance, shown, steps, has_stated)
+    kept = (_size(stated if has_stated else shown, data) / _size(rounded, data)) ** 2 if steps.any() else 1.0
     time, inflation = _correlation(data, measured, settings)
-    rest = (scale, time, inflation, int(seen.sum()))
+    report = NoiseReport(rounded, scale, time, inflation, int(seen.sum()), source, _size(rounded, data))
+    report = replace(report, steps=steps, kept=kept)
     if measured is None:
-        return NoiseReport(covariance, *rest, source, _size(covariance, data))
-    size = measured.value, measured.interval, len(measured.samples), ratio
-    return NoiseReport(covariance, *rest, measured.source, *size)
+        return report
+    n = len(measured.samples)
+    return replace(report, source=measured.source, value=measured.value, interval=measured.interval, n=n, ratio=ratio)
 
 
 @dataclass(frozen=True)
@@ -175,6 +186,25 @@ def _second_differences(data: Track, lag: int, least: int) -> tuple[Array, np.nd
     return d, np.asarray(np.isfinite(d).all(axis=2))
 
 
+def _steps(data: Track, settings: NoiseSettings) -> Array:
+    """Return the steps (3,) m in which points are written, 0 along axes where there is none."""
+    d, seen = _second_differences(data, 1, settings.least_frames)
+    return steps_of(d[seen], float(np.nanmax(np.abs(data.points), initial=0.0)), settings)
+
+
+def _with_rounding(covariance: Array, shown: Array, steps: Array, stated: bool) -> Array:
+    """Return a ``covariance`` (m, 3, 3) m2 that is no smaller along an axis than what rounding to ``steps`` (3,) m
+    makes of what repeats have ``shown`` (m, 3, 3) m2; beside one that is ``stated``, no more than rounding adds."""
+    axes = np.arange(3)
+    own, seen = covariance[:, axes, axes], shown[:, axes, axes]
+    least = seen + that_lasts(seen, np.broadcast_to(steps, seen.shape))
+    if stated:
+        least = np.minimum(least, own + of_rounding(steps))
+    out = covariance.copy()
+    out[:, axes, axes] = np.where(steps > 0.0, np.maximum(own, least), own)
+    return out
+
+
 def _stated(data: Track, settings: NoiseSettings) -> tuple[Array, bool]:
     """Return what the tracker states of each marker's usual frame (m, 3, 3), and whether it does of most of those that
     it saw."""
@@ -193,13 +223,25 @@ def _size(covariance: Array, data: Track) -> float:
     return float(np.sqrt(np.trace(covariance[ever] if ever.any() else covariance, axis1=1, axis2=2).mean()))
 
 
-def _scale(d: Array, data: Track, stated: Array, quiet: np.ndarray, lag: int, own: Array) -> float:
+def _scale(
+    d: Array,
+    data: Track,
+    stated: Array,
+    quiet: np.ndarray,
+    lag: int,
+    own: Array,
+    steps: Array,
+    settings: NoiseSettings,
+) -> float:
     """Find the variance of ``quiet`` second differences ``d`` over ``lag`` frames over the one that is stated of each
-    frame, or else (m, 3, 3) of its marker; the median keeps jerks and outliers out."""
+    frame, or else (m, 3, 3) of its marker; the median keeps jerks and outliers out, but of few ``steps`` (3,) m it is
+    one of them."""
     of_frame, marker = data.covariances[lag:-lag][quiet], np.nonzero(quiet)[1]
     known = np.isfinite(of_frame).all(axis=(1, 2))[:, None, None]
     covariance = _in_all_directions(np.where(known, of_frame, stated[marker]), own[marker])
     z2 = np.einsum("ni,nij,nj->n", d[quiet], np.linalg.inv(covariance), d[quiet]) / DIFFERENCES
+    if steps.any():
+        return float(np.mean(z2[are_usual(d[quiet], of_rounded(steps), settings.sample_outlier)]) / 3.0)
     return float(np.median(z2) / MEDIAN_CHI2_3)
 
 
@@ -316,22 +358,22 @@ def _autocovariance(residual: Array, lags: int) -> Array:
 
 
 def _without_statement(
-    measured: Measured | None, d: Array, quiet: np.ndarray, settings: NoiseSettings
+    measured: Measured | None, d: Array, quiet: np.ndarray, steps: Array, settings: NoiseSettings
 ) -> tuple[Array, Source]:
     """Return what is taken (m, 3, 3) m2 where nothing is stated: what was ``measured``, or where noise cannot be told
     from motion second differences, which motion makes larger and slow noise smaller, or an assumption."""
     m = d.shape[1]
     if measured is not None:
-        return _covariance_of(measured, m, settings), measured.source
+        return _covariance_of(measured, m, steps, settings), measured.source
     if quiet.sum() < settings.few:
         return np.broadcast_to(np.eye(3) * settings.point_sigma**2, (m, 3, 3)).copy(), "assumed"
-    covariance = _robust_covariance(d[quiet], settings.sample_outlier) / DIFFERENCES
+    covariance = _robust_covariance(d[quiet], settings.sample_outlier, of_rounded(steps)) / DIFFERENCES
     return np.broadcast_to(covariance, (m, 3, 3)).copy(), "second differences"
 
 
-def _covariance_of(measured: Measured, m: int, settings: NoiseSettings) -> Array:
+def _covariance_of(measured: Measured, m: int, steps: Array, settings: NoiseSettings) -> Array:
     """(m, 3, 3) m2 of the samples, each marker's shrunk to the common one."""
-    pooled = _robust_covariance(measured.samples, settings.sample_outlier)
+    pooled = _robust_covariance(measured.samples, settings.sample_outlier, steps)
     common = float(np.median((measured.samples**2).sum(axis=1)))
     out = np.empty((m, 3, 3))
     for i in range(m):
@@ -358,11 +400,21 @@ def _quiet_differences(data: Track, seen: np.ndarray, lag: int, settings: NoiseS
     return np.asarray(seen & rows[:, None])
 
 
-def _robust_covariance(d: Array, outlier: float) -> Array:
-    """Estimate the covariance (3, 3) of samples (n, 3) without those beyond ``outlier`` sigma of the median fit."""
-    spread = SIGMA_PER_MAD * np.median(np.abs(d), axis=0) + TINY
-    keep = (np.abs(d) / spread < outlier).all(axis=1)
-    return np.asarray(np.cov(d[keep].T) + np.eye(3) * TINY_VARIANCE)
+def of_rounded(steps: Array) -> Array:
+    """Return the sigma (c,) of second differences of errors of rounding to ``steps`` (c,) alone."""
+    return np.asarray(np.sqrt(DIFFERENCES * of_rounding(steps)))
+
+
+def are_usual(d: Array, least: Array | float, outlier: float) -> np.ndarray:
+    """Tell which samples ``d`` (n, c) are within ``outlier`` sigma of the median fit, which is not below ``least``."""
+    spread = np.maximum(SIGMA_PER_MAD * np.median(np.abs(d), axis=0) + TINY, least)
+    return np.asarray((np.abs(d) / spread < outlier).all(axis=1))
+
+
+def _robust_covariance(d: Array, outlier: float, least: Array | float = 0.0) -> Array:
+    """Estimate the covariance (3, 3) of samples (n, 3) without those beyond ``outlier`` sigma of the median fit, which
+    is not below ``least`` (3,)."""
+    return np.asarray(np.cov(d[are_usual(d, least, outlier)].T) + np.eye(3) * TINY_VARIANCE)
 
 
 def _correlation(data: Track, measured: Measured | None, settings: NoiseSettings) -> tuple[float, float]:

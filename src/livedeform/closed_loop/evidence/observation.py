@@ -62,7 +62,7 @@ class Observation:
     ``path``: all poses of the recording; ``wrench_times`` (w,) s since its start and ``wrench_forces`` (w, 3) N: all
     of its forces. ``before``: what the same body went through earlier, as far as it remembers for good.
     ``patience``: iterations for a moment, after which the model's run is given up; as many as it takes for what was
-    recorded.
+    recorded. ``force_told``: ``force_sigma`` is known to be all of the force's noise (`ForceNoise`).
     """
 
     name: str
@@ -90,6 +90,7 @@ class Observation:
     wrench_forces: Array = field(default_factory=lambda: np.zeros((0, 3)))
     before: Observation | None = None
     patience: float = np.inf
+    force_told: bool = True
 
     def force_later(self, offset: float) -> Array:
         """Return by how much (k, 3) N the recorded force at the key moments' stamps + ``offset`` s differs from that at
@@ -315,13 +316,14 @@ def _probe_at(poses: Sequence[Pose], probe: Array | None, cut: Windows) -> tuple
 def _with_forces(o: Observation, wrenches: Sequence[Wrench], cut: Windows, settings: Settings) -> Observation:
     """Add the forces at the key moments, their noise, and the recording's course of the force."""
     path = PosePath(o.path) if len(o.path) > 1 else None
-    forces, sigma = forces_at(wrenches, o.stamps_ns, cut.rows, cut.t, o.start_ns, o.force_sigma, settings, path)
+    forces, noise = forces_at(wrenches, o.stamps_ns, cut.rows, cut.t, o.start_ns, o.force_sigma, settings, path)
+    o = replace(o, force_sigma=noise.sigma, force_told=noise.told)
     if forces is None:
-        return replace(o, force_sigma=sigma)
+        return o
     in_order = sorted(wrenches, key=lambda w: w.stamp_ns)
     times = np.array([(w.stamp_ns - o.start_ns) * 1e-9 for w in in_order])
     course = np.array([w.force for w in in_order]).reshape(-1, 3)
-    return replace(o, forces=forces, force_sigma=sigma, wrench_times=times, wrench_forces=course)
+    return replace(o, forces=forces, wrench_times=times, wrench_forces=course)
 
 
 def poses_at(poses: Sequence[Pose], stamps_ns: np.ndarray, offset: float = 0.0) -> tuple[Array, Rotation]:

@@ -11,6 +11,7 @@ import numpy as np
 
 from livedeform.closed_loop.evidence.observation import Observation, observe
 from livedeform.closed_loop.evidence.own_ids import with_own_ids
+from livedeform.closed_loop.evidence.rounding import of_rounding
 from livedeform.closed_loop.evidence.track import Track, track
 from livedeform.closed_loop.progress import Tell
 from livedeform.closed_loop.settings import SamplingSettings, Settings
@@ -57,19 +58,16 @@ def read_evidence(
         rest = views[name].rest
         frames, note = marker_frames(acting, recording, rest, settings.sampling, tell)
         named, exchanged = with_own_ids(track(frames, experiment.markers.ids), exchanges_in(frames), rest)
-        notes += [f"{name}: {text}" for text in (*recording.warnings, *note, *_of_copies(named), *exchanged)]
+        warnings = [text for text in recording.warnings if text not in recording.doubts]  # which are said as such
+        notes += [f"{name}: {text}" for text in (*warnings, *note, *_of_copies(named), *exchanged)]
         seen = since_seen(without(named, recording.start_ns, release, sigma, sampling.letting_go))
+        poses = recording.poses if experiment.probe is not None else ()
         observed = observe(
-            name,
-            seen,
-            recording.poses if experiment.probe is not None else (),
-            recording.wrenches,
-            settings=settings,
-            n_moments=n_moments,
-            start_ns=recording.start_ns,
+            name, seen, poses, recording.wrenches, settings=settings, n_moments=n_moments, start_ns=recording.start_ns
         )
         observations.append(observed)
-        notes += [f"{name}: {text}" for text in _of_the_force(observed, len(recording.wrenches))]
+        told = *_of_rounding(observed), *_of_the_force(observed, len(recording.wrenches))
+        notes += [f"{name}: {text}" for text in told]
     observations = in_sequence(observations)
     fitted, held_out = observations[:n_fit], observations[n_fit:]
     if not held_out:
@@ -87,13 +85,31 @@ def _of_copies(data: Track) -> list[str]:
 
 
 def _of_the_force(o: Observation, n_wrenches: int) -> list[str]:
-    """Say where no force is compared although wrenches were recorded."""
+    """Say where no force is compared although wrenches were recorded, and where its noise is not told."""
     if n_wrenches == 0:
         return []
+    out = []
     missing = o.n_moments if o.forces is None else int((~np.isfinite(o.forces).all(axis=1)).sum())
-    if not missing:
+    if missing:
+        out = [f"at {missing} of {o.n_moments} moments no wrench was measured near by: no force is compared there"]
+    if not o.force_told:
+        out.append(
+            f"the force's noise of {o.force_sigma:.2g} N may be too small: a sensor's filter keeps samples alike, and "
+            "by its recorded poses the probe is hardly ever still for long enough to see how much that hides"
+        )
+    return out
+
+
+def _of_rounding(o: Observation) -> list[str]:
+    """Say where a good part of the noise of markers is what rounding their places leaves from frame to frame."""
+    step, share = float(o.noise.steps.max()), 1.0 - o.noise.repeated
+    lasts = share * float(np.trace(o.noise.covariance, axis1=1, axis2=2).mean())
+    if not (np.sqrt(share) > 0.5 and lasts < 2.0 * float(of_rounding(o.noise.steps).sum())):
         return []
-    return [f"at {missing} of {o.n_moments} moments no wrench was measured near by: no force is compared there"]
+    return [
+        f"places are written in steps of {1e3 * step:.2g} mm, which is more than they scatter by: {np.sqrt(share):.0%} "
+        "of their noise is errors of rounding, which frames do not average out"
+    ]
 
 
 def without(data: Track, start_ns: int, release: float, sigma: float, within: tuple[float, float]) -> Track:

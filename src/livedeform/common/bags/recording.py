@@ -78,7 +78,7 @@ class Recording:
     there already: how many were ``left_out``, and how many ``joined``; ``other_frames`` by topic the frame that it
     says, where that is not the phantom's; ``arrivals`` by topic of what was measured good stamps and when
     these messages came (of each camera's pictures a few, spread evenly, and those of the last second).
-    ``force_doubts`` say why its forces may be wrong, where that was looked at (`load_checked`).
+    ``doubts`` say why what a diagnosis concludes from it may be wrong, where that was looked at (`load_checked`).
     """
 
     path: Path
@@ -101,7 +101,7 @@ class Recording:
     repeats: Mapping[str, Repeats] = field(default_factory=dict)
     other_frames: Mapping[str, str] = field(default_factory=dict)
     arrivals: Mapping[str, Stamps] = field(default_factory=dict)
-    force_doubts: list[str] = field(default_factory=list)
+    doubts: list[str] = field(default_factory=list)
 
     @property
     def measured_frames(self) -> list[MarkerFrame]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from livedeform.common.checks.contact.held import check_held
 from livedeform.common.checks.finding import Finding
 from livedeform.common.experiment.constants import OGDEN_1972, ogden_1972, shear_modulus_of
 from livedeform.common.experiment.schema import USED_SIGMAS, Experiment
@@ -21,8 +22,9 @@ LET, METRES = "nearly nothing is wrong by that", "lengths are in metres: 2 mm is
 
 def check_declared(experiment: Experiment, body: Surface) -> list[Finding]:
     """Doubt a body that its own weight crushes, a tilt of gravity that is in degrees and a gravity in another unit by
-    all likelihood, constants of a material that contradict its modulus, errors that are large for this body, and a
-    probe's mesh in another frame than the probe's; name the standard deviations that nothing uses."""
+    all likelihood, constants of a material that contradict its modulus, errors that are large for this body, a probe's
+    mesh in another frame than the probe's, and supports that leave the body free to move; name the standard deviations
+    that nothing uses."""
     return [
         *_weight(experiment, body),
         *_constants(experiment),
@@ -30,6 +32,7 @@ def check_declared(experiment: Experiment, body: Surface) -> list[Finding]:
         *_tilt(experiment),
         *_large_errors(experiment, body),
         *_probe_frame(experiment),
+        *check_held(experiment, body),
         *_unused(experiment),
     ]
 

@@ -71,7 +71,7 @@ def check_exchanged(frames: Sequence[MarkerFrame], start_ns: int) -> list[Findin
     said = [f"{i} and {j} at {', '.join(times[:NAMED])} s" for (i, j), times in list(at.items())[:NAMED]]
     more = f" and {len(at) - NAMED} more pairs" if len(at) > NAMED else ""
     text = f"markers exchange their ids: {'; '.join(said)}{more}"
-    return [Finding("WARN", text, "correct the tracker's labels, or leave these markers out", doubts=True)]
+    return [Finding("WARN", text, "correct the tracker's labels, or leave these markers out", doubts=True, mended=True)]
 
 
 def _exchange(one: _Step, other: _Step) -> bool:

@@ -15,13 +15,14 @@ Severity = Literal["ERROR", "WARN", "NOTE"]
 class Finding:
     """``level`` ERROR: nothing can be concluded from it; WARN: it may be wrong; NOTE: worth knowing. ``remedy`` says
     what to do. A finding that ``doubts`` keeps a verdict from being sure: one ``of_forces``, which a diagnosis fits and
-    no number of a run reads, only that of a diagnosis."""
+    no number of a run reads, only that of a diagnosis; one that is ``mended`` there, only that of a run."""
 
     level: Severity
     text: str
     remedy: str = ""
     doubts: bool = False
     of_forces: bool = False
+    mended: bool = False
 
 
 def refuse_errors(findings: Iterable[Finding], where: str) -> None:

@@ -8,17 +8,15 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from livedeform.common.bags.recording import Recording
+from livedeform.common.checks.contact.distance import SurfaceDistance
 from livedeform.common.checks.finding import Finding
 from livedeform.common.experiment.schema import Experiment, ProbeShape
 from livedeform.common.experiment.surface import Surface
 from livedeform.common.types import Array, Pose
 
-N_SAMPLES = 20_000  # of the surface
-SEED = 7  # of where they lie
 MOST_POSES = 400  # looked at, spread evenly over the recording, and as many that are nearest to the body between them
 MOST_LOOKS = 200_000  # at where poses are, to find these
 TOUCH = 1e-3  # m: the body sags, and the samples are apart, by about that
@@ -37,32 +35,6 @@ class ProbeApproach:
     seconds: Array
     depths: Array
     facing: Array
-
-
-class SurfaceDistance:
-    """Signed distance (n,) m from a closed surface, positive inside, to the plane of the nearest of many samples."""
-
-    def __init__(self, surface: Surface) -> None:
-        self._surface = surface
-
-    @cached_property
-    def _samples(self) -> tuple[cKDTree, Array]:
-        a, b, c = np.moveaxis(self._surface.corners, 1, 0)
-        normals = np.cross(b - a, c - a)
-        areas = np.linalg.norm(normals, axis=1)
-        rng = np.random.default_rng(SEED)
-        rows = rng.choice(len(areas), N_SAMPLES, p=areas / areas.sum())
-        u, v = np.sqrt(rng.random(N_SAMPLES)), rng.random(N_SAMPLES)
-        points = (1 - u)[:, None] * a[rows] + (u * (1 - v))[:, None] * b[rows] + (u * v)[:, None] * c[rows]
-        return cKDTree(points), normals[rows] / areas[rows, None]
-
-    def __call__(self, points: Array) -> Array:
-        tree, normals = self._samples
-        away, nearest = tree.query(points)
-        offset = np.einsum("ij,ij->i", points - tree.data[nearest], normals[nearest])
-        # beside an edge the plane of the sample says nothing: the distance itself does
-        size = np.where(np.abs(offset) > 0.7 * away, np.abs(offset), away)
-        return np.asarray(-np.sign(offset) * size)
 
 
 @dataclass(frozen=True)
@@ -107,7 +79,7 @@ def check_probe(probe: ProbeRecord) -> list[Finding]:
         return [_too_far(probe.recording, probe.experiment, probe.body, deepest, diagonal)]
     # only near the body does the direction mean anything
     near = path.depths > max(deepest, -diagonal) - TOUCH
-    if float(np.median(path.facing[near])) < BACKWARDS:
+    if near.any() and float(np.median(path.facing[near])) < BACKWARDS:
         text = "the probe is upside down: its +z points away from the body"
         return [Finding("ERROR", text, "+z of the probe's frame points out of its face, into the tissue")]
     if deepest < -TOUCH:

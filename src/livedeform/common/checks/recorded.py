@@ -11,8 +11,11 @@ import numpy as np
 
 from livedeform.common import topics as t
 from livedeform.common.bags.recording import Recording, load_recording
+from livedeform.common.checks.arrangement import check_arrangement, radius_of
 from livedeform.common.checks.beginning import check_beginning
 from livedeform.common.checks.clocks import check_clocks
+from livedeform.common.checks.contact.first_motion import check_first_motion
+from livedeform.common.checks.contact.pushing import check_pushing
 from livedeform.common.checks.declared import check_declared
 from livedeform.common.checks.exchanged import check_exchanged
 from livedeform.common.checks.finding import Finding, Severity, refuse_errors
@@ -25,7 +28,7 @@ from livedeform.common.experiment.surface import Surface
 from livedeform.common.published_effects import impossible
 from livedeform.common.types import Array, MarkerFrame
 
-FAR_FROM_REFERENCE = 0.5  # of the body's diagonal: markers that far from their places are in another frame or unit
+FAR_FROM_REFERENCE = 1.0  # of the body's radius: markers that far from their places are in another frame or unit
 OUTSIDE_ALL, OUTSIDE_MANY = 0.99, 0.05  # shares of measured moments outside the time of the poses
 POSES_APART_NS = 500_000_000  # poses further apart are not interpolated, nor are their predictions
 SAME = 0.5  # share of equal poses from which two recordings are one
@@ -36,12 +39,17 @@ def check_recording(recording: Recording, experiment: Experiment, *, is_part: bo
     that ``is_part`` of a longer one who has that tells how it begins (`check_start`), and whether the probe touches."""
     body = read_body(experiment)
     checks: Sequence[Callable[[Recording, Experiment, Surface], list[Finding]]] = (
-        check_faults, check_frames, check_ids, check_inputs, check_stamps, check_gaps, check_places, check_exchanges,
+        check_faults, check_frames, check_ids, check_inputs, check_stamps, check_gaps, check_exchanges,
         check_clocks, check_release, check_drifts,
     )  # fmt: skip
     found = [finding for check in checks for finding in check(recording, experiment, body)]
     probe = ProbeRecord(recording, experiment, body)
-    of_probe = [*([] if is_part else [check_probe, check_beginning]), check_tared]
+    of_probe = [
+        check_places,
+        *([] if is_part else [check_probe, check_beginning, check_first_motion]),
+        check_tared,
+        check_pushing,
+    ]
     found += [finding for check in of_probe for finding in check(probe)]
     return [*found, *check_declared(experiment, body)]
 
@@ -174,21 +182,26 @@ def check_ids(recording: Recording, experiment: Experiment, body: Surface) -> li
     return found
 
 
-def check_places(recording: Recording, experiment: Experiment, body: Surface) -> list[Finding]:
-    """Check whether the markers are where the experiment has them, as far as half of the body's size."""
-    away = _away(recording.measured_frames, experiment)
+def check_places(probe: ProbeRecord) -> list[Finding]:
+    """Check whether the markers are where the experiment has them, as far as the body's radius, and what is wrong with
+    their ids, their frame or their unit if they are not (`check_arrangement`)."""
+    away = _away(probe.recording.measured_frames, probe.experiment)
     away = away[np.isfinite(away)]
     if not len(away):
         return []
-    limit = FAR_FROM_REFERENCE * body.diagonal
+    arranged = check_arrangement(probe)
+    limit = FAR_FROM_REFERENCE * radius_of(probe.body)
     far = int((away > limit).sum())
     if away[0] <= limit and not far:
-        return [Finding("NOTE", f"when first seen, the markers are {1e3 * away[0]:.3f} mm from their places (median)")]
+        text = f"when first seen, the markers are {1e3 * away[0]:.3f} mm from their places (median)"
+        return [Finding("NOTE", text), *arranged]
     if far > 0.5 * len(away) or far == len(away):
         text = f"when first seen, the markers are {away[0]:.3g} m from their places (median): another frame or unit"
-        return [Finding("ERROR", text, "give markers in metres, in the frame of markers.csv")]
+        if not arranged:
+            return [Finding("ERROR", text, "give markers in metres, in the frame of markers.csv")]
+        return [Finding("ERROR", f"{text}, or other ids: {arranged[0].text}", arranged[0].remedy)]
     text = f"in {far} of {len(away)} frames the markers are far from their places (up to {away.max():.3g} m)"
-    return [Finding("WARN", text, "check the tracker: another unit or frame in between?", doubts=True)]
+    return [Finding("WARN", text, "check the tracker: another unit or frame in between?", doubts=True), *arranged]
 
 
 def check_exchanges(recording: Recording, experiment: Experiment, body: Surface) -> list[Finding]:
@@ -255,8 +268,8 @@ def load_checked(fit: Sequence[Path], test: Sequence[Path], experiment: Experime
         findings = [*check_named(recording, experiment), *check_recording(recording, acting)]
         refuse_errors(findings, str(path))
         said = [finding.text for finding in findings if finding.level == "WARN"]
-        doubts = [finding.text for finding in findings if finding.doubts and finding.of_forces]
-        loaded.append(replace(recording, warnings=[*recording.warnings, *said], force_doubts=doubts))
+        doubts = [finding.text for finding in findings if finding.doubts and not finding.mended]
+        loaded.append(replace(recording, warnings=[*recording.warnings, *said], doubts=doubts))
     refuse_overlap(
         list(zip(fit, loaded[: len(fit)], strict=True)),
         list(zip(test, loaded[len(fit) :], strict=True)),

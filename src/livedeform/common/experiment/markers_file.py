@@ -66,7 +66,7 @@ def _columns(names: Sequence[str], path: Path) -> list[str]:
         raise InputError(
             f"column {', '.join(missing)} is missing (found: {', '.join(columns) or 'nothing'})",
             where=str(path),
-            remedy="begin the file with the line id,x,y,z",
+            remedy=_remedy(columns),
         )
     doubled = sorted({name for name in columns if name and columns.count(name) > 1})
     if doubled:
@@ -77,6 +77,20 @@ def _columns(names: Sequence[str], path: Path) -> list[str]:
             what, meant = f"a column '{near[0]}' is not read", f"call it {wanted} (lengths in metres) if that is meant"
             raise InputError(what, where=str(path), remedy=f"{meant}, or else otherwise")
     return columns
+
+
+def _remedy(columns: Sequence[str]) -> str:
+    """Return what to do about columns that are not found: their separator, or units behind their names, may be why."""
+    separator = next((s for s in (";", "\t", "|") if s in " ".join(columns)), "")
+    if separator:
+        name = {"\t": "tabs"}.get(separator, f"'{separator}'")
+        return f"columns are separated by {name}: put commas between them, and points into decimals"
+    heads = [re.match(r"([xyz])[ _]*[\[(]?[ ]*(mm|m)\b", name.lower()) for name in columns]
+    units = sorted({head[2] for head in heads if head})
+    if units:
+        option = f"; livedeform new takes millimetres with --markers-unit {units[-1]}" if units[-1] == "mm" else ""
+        return f"call the columns id,x,y,z, without their unit: lengths are in metres{option}"
+    return "begin the file with the line id,x,y,z"
 
 
 def _mistyped(name: str, wanted: str) -> bool:

@@ -22,6 +22,8 @@ from livedeform.common.types import Array
 from livedeform.fem_node.mesh.triangle_distance import TriangleTree, closest_features
 
 INNER = 9  # points along each side of a probe's box, among which its innermost is looked for
+FLAT, EDGE = np.deg2rad([1.0, 35.0])  # turns of a facetted round, from triangle to triangle; beyond, it is an edge
+FRONT = 0.25  # of the diagonal of a probe's box: the part from its face on that a body touches
 TINY = 1e-15  # m; below it a direction cannot be had from a difference of points
 
 
@@ -42,7 +44,7 @@ class Shape(Protocol):
 
     @property
     def roundness(self) -> float:
-        """The smallest radius of its edges, m; NaN where it is not known."""
+        """The smallest radius of its edges, m; infinite where it has none."""
 
     def distance(self, points: Array) -> Distance:
         """Signed distance and its derivatives at ``points`` (n, 3) m in the frame ``probe``."""
@@ -159,9 +161,24 @@ class TriangleSolid:
     def bounds(self) -> Array:
         return np.array([self.vertices.min(axis=0), self.vertices.max(axis=0)])
 
-    @property
+    @cached_property
     def roundness(self) -> float:
-        return float("nan")
+        """The smallest radius of the ridges of its front, m: how far triangles on both sides reach over the angle by
+        which they turn, as of a facetted round; nothing where they turn by more than a facetted round's do."""
+        import trimesh
+
+        mesh = trimesh.Trimesh(self.vertices, self.triangles, process=False)
+        ridge = mesh.face_adjacency_convex & (mesh.face_adjacency_angles > FLAT)
+        lowest = self.bounds[1, 2] - FRONT * np.linalg.norm(np.ptp(self.bounds, axis=0))
+        ridge &= self.vertices[mesh.face_adjacency_edges][..., 2].max(axis=1) > lowest
+        if not ridge.any():
+            return float("inf")
+        pairs, turns = mesh.face_adjacency[ridge], mesh.face_adjacency_angles[ridge]
+        if turns.max() > EDGE:
+            return 0.0
+        length = np.linalg.norm(np.diff(self.vertices[mesh.face_adjacency_edges[ridge]], axis=1)[:, 0], axis=1)
+        reach = 2.0 / 3.0 * mesh.area_faces[pairs].sum(axis=1) / length  # of both middles from the edge
+        return float(np.min(reach / turns))
 
     @cached_property
     def _tree(self) -> TriangleTree:

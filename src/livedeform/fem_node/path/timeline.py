@@ -196,5 +196,5 @@ def _steps_of(start: Array | None, end: Array | None, longest: float) -> int:
     if start is None or end is None:
         return 1
     face = LEVER * np.eye(3)  # points of the probe that also tell a turn
-    path = np.abs(end[:3, :3] @ face - start[:3, :3] @ face + (end - start)[:3, 3:]).max()
+    path = np.linalg.norm(end[:3, :3] @ face - start[:3, :3] @ face + (end - start)[:3, 3:], axis=0).max()
     return int(np.clip(np.ceil(path / longest), 1, MOST_PATH_STEPS))

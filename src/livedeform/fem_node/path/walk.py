@@ -82,6 +82,7 @@ class Walk:
     walk_settings: WalkSettings = WALK
     _passed: dict[int, _Passed] = field(default_factory=dict)  # by stamp
     _begun: bool = False
+    _active: bool = False  # whether weight and loads acted at the instant that was passed last
 
     def to(self, stamp_ns: int, wanted: Sequence[int] = ()) -> int:
         """Go to ``stamp_ns``, with the sensitivities number ``wanted`` there; return the iterations that it took.
@@ -125,17 +126,19 @@ class Walk:
         """Solve and commit one instant; return its iterations."""
         body = self.body
         moment = self.line.moment(body.physics, instant, self.pose_at)
-        there = instant.stamp_ns == stamp_ns and instant.with_probe
+        # at rest at the release, and loaded a moment later at the same stamp
+        passing = not (instant.active or self.line.dynamic) and self.line.acts(instant.stamp_ns)
+        there = instant.stamp_ns == stamp_ns and instant.with_probe and not passing
         if moment.held:
             if self.sensitivities is not None:
                 self.sensitivities.pass_held(partial(self.line.moment, instant=instant, pose_at=self.pose_at))
             body.pass_held(moment)
-            self._begun = True
+            self._begun, self._active = True, instant.active
             return 0
         if body.contact is not None and body.memory.rubs:
             body.contact.exactness = 1.0 if instant.stamp_ns == stamp_ns else self.walk_settings.between
         warm = None if body.memory.rings else self.warm
-        key = None if warm is None else warm.key(instant.stamp_ns, moment, first=not self._begun)
+        key = None if warm is None or passing else warm.key(instant.stamp_ns, moment, first=not self._begun)
         known = None if warm is None or key is None else warm.solved(body, key, moment)
         known = self._untouched(stamp_ns, moment) if known is None and there else known
         starts = () if known is not None else self._starts(stamp_ns, key, moment)
@@ -151,7 +154,7 @@ class Walk:
             moment_of = partial(self.line.moment, instant=instant, pose_at=self.pose_at)
             self.sensitivities.step(solution.x, moment_of, there=there, wanted=wanted)
         body.commit(solution.x, moment)
-        self._begun = True
+        self._begun, self._active = True, instant.active
         if warm is not None and key is not None:
             warm.note(body, stamp_ns, key, moment)
             if there and self.sensitivities is not None:
@@ -185,6 +188,5 @@ class Walk:
         """Return what is to be known of the stamp that was just reached."""
         contact = self.body.contact
         touches = contact is not None and bool(contact.state.touches.any())
-        active = self.line.acts(stamp_ns)
         saved = None if contact is None or touches else contact.save()
-        return _Passed(self._pose(stamp_ns), active, None if touches else self.body.x, saved)
+        return _Passed(self._pose(stamp_ns), self._active, None if touches else self.body.x, saved)

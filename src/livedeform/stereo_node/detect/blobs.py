@@ -148,7 +148,7 @@ def _flattened(shapes: Array) -> Array:
     values, vectors = np.linalg.eigh(shapes)
     size = 0.5 * np.log(np.maximum(values[:, 1], 1e-12) / np.maximum(values[:, 0], 1e-12))
     angle = 2.0 * np.arctan2(vectors[:, 1, 0], vectors[:, 0, 0])
-    return size[:, None] * np.column_stack([np.cos(angle), np.sin(angle)])
+    return np.asarray(size[:, None] * np.column_stack([np.cos(angle), np.sin(angle)]))
 
 
 def _of_neighbours(centres: Array, flattened: Array, rows: NDArray[np.intp]) -> Array:

@@ -18,11 +18,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from livedeform.common.types import Array
+from livedeform.stereo_node.track.apart import assign_apart_and_without
+from livedeform.stereo_node.track.field import MIN_NEIGHBOURS, Among, SmoothField
 from livedeform.stereo_node.track.match import Pairs, assign
+from livedeform.stereo_node.track.near import distances, mahalanobis2
 from livedeform.stereo_node.track.shifts import filled, shifted
 
 Rows = NDArray[np.int64]
-MIN_NEIGHBOURS = 8
 MAY_BE_NEIGHBOURS = "may be its neighbour"  # why none of these is published
 
 
@@ -77,12 +79,11 @@ class IdentityTracker:
         self.stamp_ns: int | None = None
         self._n_by_model = 0
         self._in_doubt = False
-        distance = np.linalg.norm(rest[:, None] - rest[None], axis=2)
+        distance = distances(rest, rest)
         np.fill_diagonal(distance, np.inf)
         self.spacing = distance.min(axis=1) if len(rest) > 1 else np.full(len(rest), np.inf)
         length = settings.smooth_length * float(np.median(self.spacing)) if len(rest) > 1 else 1.0
-        a = np.sqrt(3) * np.where(np.isfinite(distance), distance, 0.0) / length
-        self._kernel = (1 + a) * np.exp(-a)  # Matern 3/2: a field with continuous slopes
+        self._field = SmoothField(np.where(np.isfinite(distance), distance, 0.0), length)
 
     def predict(self, stamp_ns: int, model: Array | None = None) -> tuple[Array, Array]:
         """Predict positions (m, 3) at ``stamp_ns`` and their sigmas (m,); ``model`` (m, 3): the model's prediction, NaN
@@ -137,17 +138,10 @@ class IdentityTracker:
     def _kriged(
         self, base: Array, lost: NDArray[np.bool_], position: Array, fresh: NDArray[np.bool_]
     ) -> tuple[Array, Array, float]:
-        """Return ``base`` of the lost markers plus what the ``fresh`` ones are beside theirs, carried over by a
-        Gaussian process (kriging; Rasmussen & Williams 2.2), the standard deviation of that, and the size of that
-        field, m."""
-        displacement = (position - base)[fresh]
-        mean = displacement.mean(axis=0)
-        K = self._kernel[np.ix_(fresh, fresh)] + 1e-3 * np.eye(int(fresh.sum()))
-        k = self._kernel[np.ix_(lost, fresh)]
-        weights = np.linalg.solve(K, k.T).T
-        left_over = np.maximum(1 - (weights * k).sum(axis=1), 0.0)
-        size = self._size(np.flatnonzero(fresh), displacement)
-        return base[lost] + mean + weights @ (displacement - mean), size * np.sqrt(left_over), size
+        """Return ``base`` of the lost markers plus what the ``fresh`` ones are beside theirs, carried over by the
+        smooth field, the standard deviation of that, and the size of that field, m."""
+        moved, spread, size = self._field.carried(np.flatnonzero(fresh), (position - base)[fresh], np.flatnonzero(lost))
+        return base[lost] + moved, spread, size
 
     def update(
         self, stamp_ns: int, pairs: Pairs, model: Array | None = None, names: NDArray[np.int64] | None = None
@@ -202,32 +196,35 @@ class IdentityTracker:
         row_of[markers] = rows
         # what is in doubt as a marker that comes back is in its place all the same
         row_of = filled(row_of, position, self.spacing, np.flatnonzero(_untouched(pairs, rows)), pairs)
-        together, size = self._moving_together(pairs, row_of, position)
         free = np.flatnonzero(_untouched(pairs, row_of[row_of >= 0]))
         reach = s.gate * (s.jitter + s.speed_change * dt) + 0.5 * float(np.median(self.spacing))
+        together, size = -1, 0.0
         for other in shifted(position, self.spacing, row_of, free, pairs, reach):
-            as_well, other_size = self._moving_together(pairs, other, position)
-            if as_well.sum() > together.sum() and other_size**2 < s.distinct * (size**2 + s.jitter**2):
+            if together < 0:
+                named, surprise, field = self._named(pairs, row_of, position)
+                together, size = int(self._together(pairs, row_of[named], field, surprise).sum()), field.size(surprise)
+            # what costs least is asked first
+            if ((other >= 0) & self.ever_seen).sum() <= together:
+                continue
+            named, surprise, field = self._named(pairs, other, position)
+            if (
+                field.size(surprise) ** 2 < s.distinct * (size**2 + s.jitter**2)
+                and self._together(pairs, other[named], field, surprise, together + 1).sum() > together
+            ):
                 return True
         return False
 
-    def _moving_together(self, pairs: Pairs, row_of: Rows, position: Array) -> tuple[NDArray[np.bool_], float]:
-        """Tell which markers (m,) move with their neighbours if the rows ``row_of`` (m,) of ``pairs`` are theirs, -1
-        for none, and the size (m) of the field by which all of them moved from ``position`` (m, 3) m."""
+    def _named(self, pairs: Pairs, row_of: Rows, position: Array) -> tuple[Rows, Array, Among]:
+        """Return the markers (n,) seen before that have one of the rows ``row_of`` (m,) of ``pairs``, -1 for none, how
+        far (n, 3) m they are from ``position`` (m, 3) m, and what solves for their field."""
         named = np.flatnonzero((row_of >= 0) & self.ever_seen)
-        surprise = pairs.points.points[row_of[named]] - position[named]
-        together = np.zeros(len(row_of), bool)
-        together[named] = self._moves_with_neighbours(named, surprise, pairs.points.covariances[row_of[named]])
-        return together, self._size(named, surprise)
+        return named, pairs.points.points[row_of[named]] - position[named], self._field.among(named)
 
-    def _size(self, markers: Rows, moved: Array) -> float:
-        """Return the size (m) of the smooth field that ``moved`` the markers (n,) by (n, 3) m, beside their mean."""
-        if len(markers) == 0:
-            return 0.0
-        K = self._kernel[np.ix_(markers, markers)] + 1e-3 * np.eye(len(markers))
-        rest = moved - moved.mean(axis=0)
-        # from the data themselves (their quadratic form), per axis
-        return float(np.sqrt((rest * np.linalg.solve(K, rest)).sum() / (3 * len(rest))))
+    def _together(self, pairs: Pairs, rows: Rows, field: Among, surprise: Array, least: int = 0) -> NDArray[np.bool_]:
+        """Tell which markers (n,) of a ``field``, with the ``rows`` (n,) of ``pairs``, move with their neighbours; any,
+        where there are less than ``least``. A false spot beside a marker that was missed does not."""
+        noise = np.sqrt(np.trace(pairs.points.covariances[rows], axis1=1, axis2=2))
+        return field.move_together(surprise, self.settings.torn + 4 * noise, least)
 
     def _update_named(self, stamp_ns: int, pairs: Pairs, names: Rows) -> Tracked:
         rows = np.flatnonzero(names >= 0)
@@ -242,8 +239,8 @@ class IdentityTracker:
         """
         s, fresh = self.settings, self.fresh
         reach = np.where(fresh, s.spacing_share * self.spacing, np.inf)
-        cost = self._cost(position, sigma, pairs.points.points, pairs.points.covariances, reach)
-        cost = cost + ((pairs.epipolar_px / pairs.epipolar_sigma_px) ** 2)[None]
+        cost = mahalanobis2(position, sigma, reach, pairs.points.points, pairs.points.covariances, s.gate)
+        cost += ((pairs.epipolar_px / pairs.epipolar_sigma_px) ** 2)[None]
         markers, rows = _assign_apart(cost[fresh], pairs, s.gate**2 + 16.0)
         markers = np.flatnonzero(fresh)[markers]
         back_markers, back_rows, doubtful = self._returning(cost, ~fresh, _untouched(pairs, rows), pairs)
@@ -254,8 +251,7 @@ class IdentityTracker:
         surprise = pairs.points.points[rows] - position[markers]
         known = self.ever_seen[markers]
         smooth = np.ones(len(markers), bool)
-        covariances = pairs.points.covariances[rows[known]]
-        smooth[known] = self._moves_with_neighbours(markers[known], surprise[known], covariances)
+        smooth[known] = self._together(pairs, rows[known], self._field.among(markers[known]), surprise[known])
         return smooth
 
     def _learn_rest(self, markers: Rows, surprise: Array) -> None:
@@ -263,61 +259,18 @@ class IdentityTracker:
         new = ~self.ever_seen[markers]
         self.rest[markers[new]] += surprise[new]
 
-    def _moves_with_neighbours(self, markers: Rows, surprise: Array, covariances: Array) -> NDArray[np.bool_]:
-        """Return which markers are about as far from their prediction, ``surprise`` (n, 3), as their neighbours
-        foretell (leave-one-out kriging; Rasmussen & Williams 5.4.2). A false spot beside a marker that was missed is
-        not. Worst first, one by one."""
-        keep = np.ones(len(markers), bool)
-        noise = np.sqrt(np.trace(covariances, axis1=1, axis2=2))
-        while keep.sum() >= MIN_NEIGHBOURS:
-            rows = np.flatnonzero(keep)
-            precision = np.linalg.inv(self._kernel[np.ix_(markers[rows], markers[rows])] + 1e-3 * np.eye(len(rows)))
-            spread = 1 / np.sqrt(np.diag(precision))
-            off = np.linalg.norm(precision @ (surprise[rows] - np.median(surprise[rows], axis=0)), axis=1) * spread**2
-            size = np.median(off / spread)
-            excess = off - (self.settings.torn + 4 * noise[rows] + 6 * size * spread)
-            worst = int(np.argmax(excess))
-            if excess[worst] <= 0:
-                break
-            keep[rows[worst]] = False
-        return keep
-
-    def _cost(self, position: Array, sigma: Array, points: Array, covariances: Array, reach: Array) -> Array:
-        """Compute the squared Mahalanobis distance (m, k) of every point from every marker's prediction, inf outside
-        its gate."""
-        difference = points[None] - position[:, None]
-        distance = np.linalg.norm(difference, axis=2)
-        out = np.full(distance.shape, np.inf)
-        # far pairs are sorted out by distance first: most of the table is far
-        near = (distance < reach[:, None]) & (
-            distance < self.settings.gate * (sigma[:, None] + np.sqrt(covariances.trace(axis1=1, axis2=2))[None])
-        )
-        i, j = np.nonzero(near)
-        S = covariances[j] + (sigma[i] ** 2)[:, None, None] * np.eye(3)
-        d = difference[i, j]
-        d2 = np.einsum("ni,ni->n", d, np.linalg.solve(S, d[:, :, None])[:, :, 0])
-        inside = d2 < self.settings.gate**2
-        out[i[inside], j[inside]] = d2[inside]
-        return out
-
     def _returning(
         self, cost: Array, lost: NDArray[np.bool_], free: NDArray[np.bool_], pairs: Pairs
     ) -> tuple[Rows, Rows, int]:
         """Find lost markers that are surely seen again: rows of markers, of pairs, and how many were in doubt."""
         lost_rows, free_rows = np.flatnonzero(lost), np.flatnonzero(free)
-        if not len(lost_rows) or not len(free_rows):
-            return np.zeros(0, np.int64), np.zeros(0, np.int64), 0
         table = cost[np.ix_(lost_rows, free_rows)]
         free_pairs, limit = pairs.take(free_rows), self.settings.gate**2 + 16.0
-        i, j = _assign_apart(table, free_pairs, limit)
-        best = _total(table, i, j, limit)
-        clear = np.ones(len(i), bool)
-        for k, (a, b) in enumerate(zip(i, j, strict=True)):  # how much worse is the world in which this is not so?
-            without = table.copy()
-            without[a, b] = np.inf
-            clear[k] = (
-                _total(without, *_assign_apart(without, free_pairs, limit), limit) - best > self.settings.distinct
-            )
+        table[table >= limit] = np.inf
+        column, best, without = assign_apart_and_without(table, free_pairs.left, free_pairs.right, limit)
+        i = np.flatnonzero(column >= 0)
+        j = column[i]
+        clear = without[i] - best > self.settings.distinct  # how much worse is the world in which this is not so?
         return lost_rows[i[clear]], free_rows[j[clear]], int((~clear).sum())
 
     def _advance(self, stamp_ns: int, markers: Rows, points: Array) -> None:
@@ -344,24 +297,21 @@ def _assign_apart(cost: Array, pairs: Pairs, limit: float) -> tuple[Rows, Rows]:
     cost = cost.copy()
     for _ in range(20):
         rows, cols = assign(cost, limit)
-        worst: list[tuple[int, int]] = []
+        order = np.argsort(cost[rows, cols])
+        worse = np.zeros(len(rows), bool)
         for blobs in (pairs.left[cols], pairs.right[cols]):
-            order = np.argsort(cost[rows, cols])
-            first: set[int] = set()
-            for k in order:
-                if int(blobs[k]) in first:
-                    worst.append((int(rows[k]), int(cols[k])))
-                first.add(int(blobs[k]))
-        if not worst:
+            worse[order] |= _is_again(blobs[order])
+        if not worse.any():
             break
-        for row, col in worst:
-            cost[row, col] = np.inf
+        cost[rows[worse], cols[worse]] = np.inf
     return rows, cols
 
 
-def _total(cost: Array, rows: Rows, cols: Rows, limit: float) -> float:
-    """Return cost of an assignment, with ``limit`` for every row that is left alone."""
-    return float(cost[rows, cols].sum() + limit * (len(cost) - len(rows)))
+def _is_again(values: Rows) -> NDArray[np.bool_]:
+    """Tell which values (n,) were among those before them."""
+    again = np.ones(len(values), bool)
+    again[np.unique(values, return_index=True)[1]] = False
+    return again
 
 
 def _untouched(pairs: Pairs, rows: Rows) -> NDArray[np.bool_]:

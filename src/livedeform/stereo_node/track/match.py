@@ -116,12 +116,22 @@ def candidate_pairs(rig: StereoRig, left: Blobs, right: Blobs, settings: MatchSe
 def assign(cost: Array, limit: float) -> tuple[Rows, Rows]:
     """Find rows and columns of the assignment of least total cost; leaving a row alone costs ``limit``, inf forbids a
     pair."""
-    n, m = cost.shape
-    if n == 0 or m == 0:
-        return np.zeros(0, np.int64), np.zeros(0, np.int64)
+    allowed = cost < limit
+    choices, wanted = allowed.sum(axis=1), allowed.sum(axis=0)
+    i = np.flatnonzero(choices == 1)
+    j = allowed[i].argmax(axis=1) if cost.size else i
+    i, j = i[wanted[j] == 1], j[wanted[j] == 1]
+    choices[i] = wanted[j] = 0
+    rows, cols = np.flatnonzero(choices), np.flatnonzero(wanted)  # what is contested
+    n, m = len(rows), len(cols)
+    if n == 0:
+        return i, j
+    at = np.ix_(rows, cols)
     square = np.full((n, m + n), np.inf)
-    square[:, :m] = np.where(cost < limit, cost, np.inf)
+    square[:, :m] = np.where(allowed[at], cost[at], np.inf)
     square[np.arange(n), m + np.arange(n)] = limit
-    rows, cols = linear_sum_assignment(square)
-    real = cols < m
-    return rows[real], cols[real]
+    by, to = linear_sum_assignment(square)
+    real = to < m
+    i, j = np.append(i, rows[by[real]]), np.append(j, cols[to[real]])
+    order = np.argsort(i)
+    return i[order], j[order]

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from livedeform.common.types import Array
 from livedeform.stereo_node.track.match import Pairs, assign
+from livedeform.stereo_node.track.near import distances
 
 Rows = NDArray[np.int64]
 
@@ -27,7 +28,7 @@ def shifted(position: Array, spacing: Array, row_of: Rows, free: Rows, pairs: Pa
     """
     chains = _chains(position, spacing, row_of, free, pairs.points.points, reach)
     moves = np.array([pairs.points.points[rows[0]] - position[markers[0]] for markers, rows in chains]).reshape(-1, 3)
-    alike = np.linalg.norm(moves[:, None] - moves[None], axis=2) < 0.5 * np.median(spacing)
+    alike = distances(moves, moves) < 0.5 * np.median(spacing)
     covered = np.zeros(len(chains), bool)
     for first in np.argsort(-alike.sum(axis=1), kind="stable"):
         if covered[first]:
@@ -45,7 +46,7 @@ def filled(row_of: Rows, places: Array, spacing: Array, free: Rows, pairs: Pairs
     """Return ``row_of`` (m,) in which markers without a point have that of the ``free`` (k,) rows of ``pairs`` which
     lies at their ``places`` (m, 3) m, within half the ``spacing`` (m,) m."""
     out, missing = row_of.copy(), np.flatnonzero(row_of < 0)
-    off = np.linalg.norm(pairs.points.points[free][None] - places[missing][:, None], axis=2)
+    off = distances(places[missing], pairs.points.points[free])
     markers, columns = assign(off / spacing[missing][:, None], 0.5)
     out[missing[markers]] = free[columns]
     return out
@@ -56,13 +57,12 @@ def _chains(
 ) -> list[tuple[Rows, Rows]]:
     """Return the chains from ``free`` points to missing markers, over one marker at least that has a point: the
     markers (n,) and the rows (n,) that would be theirs."""
-    apart = np.linalg.norm(points[free][:, None] - position[None], axis=2)
-    starts, current = np.nonzero((apart < reach) & (row_of >= 0))
+    starts, current = np.nonzero((distances(points[free], position) < reach) & (row_of >= 0))
     move = points[free[starts]] - position[current]
     markers, rows, out = current[:, None], free[starts][:, None], []
     while len(current):
         freed = row_of[current]
-        off = np.linalg.norm((points[freed] - move)[:, None] - position[None], axis=2)
+        off = distances(points[freed] - move, position)
         current = off.argmin(axis=1)
         going = (off.min(axis=1) < 0.5 * spacing[current]) & (markers != current[:, None]).all(axis=1)
         current, freed = current[going], freed[going]

@@ -26,12 +26,12 @@ from numpy.typing import NDArray
 
 from livedeform.common.types import Array
 from livedeform.stereo_node.detect.picture import Picture
-from livedeform.stereo_node.detect.tags.model import beyond, blurred_code
+from livedeform.stereo_node.detect.tags.model import beyond, blurred_code, derivatives
+from livedeform.stereo_node.detect.tags.robust import fit_robustly
 
 N_ITERATIONS, N_BLURRED = 25, 3  # at most; steps after which edges are found also from afar
 SETTLED = 0.1  # sigmas, a step of the middle after which it stays where it is
 LONGEST_STEP, FARTHEST = 0.3, 0.7  # modules: of the middle's step; from where the tag was found
-ROBUST = 4.0  # residual sigmas, beyond which a pixel's weight falls off
 LEAST_STEP = 8.0  # grey values between black and white
 RIM = 2.5  # blurs: as near to its outer edge the border shows what is beyond
 MOST_PIXELS = 1600  # of larger tags every second row and column takes part, or every third
@@ -60,12 +60,14 @@ def tag_middles(picture: Picture, quads: Array, codes: Array, noise: float) -> t
 
 @dataclass(frozen=True)
 class _TagPixels:
-    """The pixels about a tag: places ``at`` (k, 2) px from ``origin`` (2,), ``grey`` values (k,), the ``code`` (m, m),
-    the homography's numbers ``start`` (8,) by which it was found, and the size of a ``module`` px."""
+    """The pixels about a tag: places ``at`` (k, 2) px from ``origin`` (2,), ``grey`` values (k,), the ``code``
+    (m + 2, m + 2) with the white around, ``half`` its side in modules, the homography's numbers ``start`` (8,) by which
+    it was found, and the size of a ``module`` px."""
 
     at: Array
     grey: Array
     code: Array
+    half: float
     origin: Array
     start: Array
     module: float
@@ -73,17 +75,19 @@ class _TagPixels:
 
 @dataclass(frozen=True)
 class _BlurredCode:
-    """The blurred code at pixels (k,): places ``at`` (k, 2) px from the patch's origin, ``grey`` values, the share of
-    white ``P`` with its gradient ``slope`` (k, 2) 1/px and its derivative ``by_blur`` 1/px, places in ``modules``
-    (k, 2) and the perspective's ``depth`` (k,)."""
+    """The blurred code at pixels (k,): places ``at`` (k, 2) px from the patch's origin, ``grey`` values, and what
+    `blurred_code` ``told`` (7, k) of them."""
 
     at: Array
     grey: Array
-    P: Array
-    slope: Array
-    by_blur: Array
-    modules: Array
-    depth: Array
+    told: Array
+
+    def derivatives(self, light: Array, s: float) -> Array:
+        """Return the derivatives (k, 24) of the greys by shape and light, in a ``light`` (9,), with a blur of ``s``
+        px."""
+        J = np.empty((len(self.at), N_SHAPE + N_LIGHT))
+        derivatives(self.at, self.told, light, s, J)
+        return J
 
 
 def _cut_out(picture: Picture, quad: Array, code: Array) -> _TagPixels | None:
@@ -100,7 +104,9 @@ def _cut_out(picture: Picture, quad: Array, code: Array) -> _TagPixels | None:
     step = int(np.ceil(np.sqrt((high - low).prod() / MOST_PIXELS)))
     v, u = np.mgrid[low[1] : high[1] : step, low[0] : high[0] : step].reshape(2, -1)
     at = np.stack([u, v], axis=1) - origin
-    return _TagPixels(at, picture[v, u].astype(float), code, origin, np.asarray(H.ravel()[:8], float), module)
+    start, around = np.asarray(H.ravel()[:8], float), np.ones((len(code) + 2, len(code) + 2))
+    around[1:-1, 1:-1] = code
+    return _TagPixels(at, picture[v, u].astype(float), around, half, origin, start, module)
 
 
 @dataclass(frozen=True)
@@ -118,9 +124,9 @@ class _Tag:
 def _fit(patch: _TagPixels, noise: float) -> tuple[Array, Array] | None:
     """Return the middle (2,) px from the patch's origin and its covariance (2, 2) px2; None where no tag shows."""
     shape = np.concatenate([patch.start, [max(BLURRED * patch.module, LEAST_BLUR)], np.zeros(6)])
-    start = _Tag(shape, np.zeros(N_LIGHT), np.zeros((2, 2)), 0.0, 4 * BEND * patch.module / len(patch.code))
+    start = _Tag(shape, np.zeros(N_LIGHT), np.zeros((2, 2)), 0.0, 2 * BEND * patch.module / patch.half)
     pattern = _pattern(patch, shape, _within(patch, shape, 0.0))
-    planes = _light(pattern, start.light, 0.0)[:, :-3]
+    planes = pattern.derivatives(start.light, 0.0)[:, N_SHAPE:-3]
     start.light[:-3] = np.linalg.lstsq(planes, pattern.grey, rcond=None)[0]
     tag = _descend(patch, start, -RIM, start.bent)
     if tag is None:
@@ -143,8 +149,9 @@ def _descend(patch: _TagPixels, tag: _Tag, reach: float, most_bent: float) -> _T
             return None
         tight = np.zeros(N_SHAPE + N_LIGHT)
         tight[9:N_SHAPE] = bent**-2
-        J = np.concatenate([_by_shape(pattern, tag.light), _light(pattern, tag.light, tag.shape[8])], axis=1)
-        x, C, variance = _robust(J, pattern.grey, tight, -np.append(tag.shape, tag.light))
+        J, C = pattern.derivatives(tag.light, tag.shape[8]), np.empty((len(tight), len(tight)))
+        x = -np.append(tag.shape, tag.light)  # what is known
+        variance = fit_robustly(J, pattern.grey, tight, x, C)
         if not np.isfinite(x).all():
             return None
         move = float(np.abs(x[MIDDLE]).max())
@@ -163,8 +170,8 @@ def _descend(patch: _TagPixels, tag: _Tag, reach: float, most_bent: float) -> _T
 def _white_around(patch: _TagPixels, tag: _Tag) -> bool:
     """Tell whether what is beyond the outer edge is as white as the light on the tag says."""
     pattern = _pattern(patch, tag.shape, _within(patch, tag.shape, RIM))
-    beyond = np.abs(pattern.modules).max(axis=1) > 0.5 * len(patch.code)
-    r = (pattern.grey - _light(pattern, tag.light, tag.shape[8]) @ tag.light)[beyond]
+    beyond = np.abs(pattern.told[4:6]).max(axis=0) > patch.half
+    r = (pattern.grey - pattern.derivatives(tag.light, tag.shape[8])[:, N_SHAPE:] @ tag.light)[beyond]
     limit = np.hypot(WHITE * (tag.light[0] - tag.light[3]), np.sqrt(2 * tag.variance))
     return bool(len(r) and np.sqrt((r**2).mean()) < limit)
 
@@ -172,7 +179,7 @@ def _white_around(patch: _TagPixels, tag: _Tag) -> bool:
 def _within(patch: _TagPixels, shape: Array, reach: float) -> NDArray[np.bool_]:
     """Tell which pixels (k,) lie as far as ``reach`` blurs beyond the tag's outer edge, or farther in."""
     out = np.empty(len(patch.at))
-    beyond(patch.at, shape, _inverse(shape), 0.5 * len(patch.code), out)
+    beyond(patch.at, shape, _inverse(shape), patch.half, out)
     told: NDArray[np.bool_] = out < reach
     return told
 
@@ -181,58 +188,10 @@ def _pattern(patch: _TagPixels, shape: Array, used: NDArray[np.bool_]) -> _Blurr
     """Return the blurred code at the pixels that are ``used`` (k,)."""
     at = patch.at[used]
     out = np.empty((7, len(at)))
-    blurred_code(at, shape, _inverse(shape), np.pad(patch.code, 1, constant_values=1.0), out)
-    return _BlurredCode(at, patch.grey[used], out[0], out[1:3].T, out[3], out[4:6].T, out[6])
+    blurred_code(at, shape, _inverse(shape), patch.code, out)
+    return _BlurredCode(at, patch.grey[used], out)
 
 
 def _inverse(shape: Array) -> Array:
     """Return the inverse (3, 3) of the homography's matrix."""
     return np.linalg.inv(np.append(shape[:8], 1.0).reshape(3, 3))
-
-
-def _quadratic(XY: Array) -> Array:
-    """Return X^2, XY and Y^2 (k, 3) of places (k, 2)."""
-    X, Y = XY.T
-    return np.stack([X * X, X * Y, Y * Y], axis=1)
-
-
-def _by_shape(pattern: _BlurredCode, light: Array) -> Array:
-    """Return the derivatives (k, 15) of the greys by the homography's numbers, the blur and the bends, in a ``light``
-    (9,)."""
-    contrast = light[0] - light[3] + pattern.at @ (light[1:3] - light[4:6])
-    # what moves a module to another place lets the pixel see a place that lies the other way
-    moved = -contrast[:, None] * pattern.slope
-    flat = moved / pattern.depth[:, None]
-    XY1 = np.column_stack([pattern.modules, np.ones(len(moved))])
-    farther = (flat * pattern.at).sum(axis=1)
-    bends = (_quadratic(pattern.modules)[:, :, None] * moved[:, None]).reshape(-1, 6)
-    H = [flat[:, :1] * XY1, flat[:, 1:] * XY1, -farther[:, None] * pattern.modules]
-    return np.column_stack([*H, contrast * pattern.by_blur, bends])
-
-
-def _light(pattern: _BlurredCode, light: Array, s: float) -> Array:
-    """Return the derivatives (k, 9) of the greys by the planes of white and black and by the light's curves, about a
-    ``light`` (9,) and with a blur of ``s`` px."""
-    u, v = pattern.at.T
-    planes = np.stack([np.ones_like(u), u, v], axis=1)
-    white, black = pattern.P[:, None] * planes, (1 - pattern.P)[:, None] * planes
-    level = white[:, 0] * light[0] + black[:, 0] * light[3]
-    white[:, 1:] += s**2 * pattern.slope
-    black[:, 1:] -= s**2 * pattern.slope
-    curves = level[:, None] / max(abs(light[0]), 1.0) * _quadratic(pattern.at)
-    return np.concatenate([white, black, curves], axis=1)
-
-
-def _robust(J: Array, grey: Array, tight: Array, known: Array) -> tuple[Array, Array, float]:
-    """Solve ``J`` (k, n) x = ``grey`` (k,) with weights that fall off for pixels that do not fit, where x is ``known``
-    (n,) with the inverse variances ``tight`` (n,): x (n,), its covariance (n, n) and the residuals' variance."""
-    weight, variance = np.ones(len(grey)), 1.0
-    for _ in range(3):
-        N = J.T @ (weight[:, None] * J) + np.diag(variance * tight)
-        norm = np.sqrt(np.maximum(np.diag(N), 1e-12))
-        C = np.linalg.inv(N / np.outer(norm, norm) + 1e-10 * np.eye(len(N))) / np.outer(norm, norm)
-        x = C @ (J.T @ (weight * grey) + variance * tight * known)
-        r = grey - J @ x
-        variance = float((weight @ r**2) / max(weight.sum() - N_SHAPE - N_LIGHT, 1.0))
-        weight = 1 / np.maximum(np.abs(r) / (ROBUST * np.sqrt(variance) + 1e-9), 1.0) ** 2
-    return x, variance * C, variance

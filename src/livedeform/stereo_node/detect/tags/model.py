@@ -78,13 +78,40 @@ def blurred_code(at, shape, inverse, code, out):
         top, bottom = _profile(Y, high, m, g)
         P = P_X = P_Y = P_XY = by_blur = 0.0
         for i in range(top, bottom + 1):
+            row = row_X = row_blur = 0.0
             for j in range(left, right + 1):
-                if code[i, j] > 0.0:
-                    P += f[0, j] * g[0, i]
-                    P_X += f[1, j] * g[0, i]
-                    P_Y += f[0, j] * g[1, i]
-                    P_XY += f[1, j] * g[1, i]
-                    by_blur += f[2, j] * g[0, i] + f[0, j] * g[2, i]
+                row += code[i, j] * f[0, j]
+                row_X += code[i, j] * f[1, j]
+                row_blur += code[i, j] * f[2, j]
+            P += row * g[0, i]
+            P_X += row_X * g[0, i]
+            P_Y += row * g[1, i]
+            P_XY += row_X * g[1, i]
+            by_blur += row_blur * g[0, i] + row * g[2, i]
         out[0, k] = P + s * s * (X_u * Y_u + X_v * Y_v) * P_XY
         out[1, k], out[2, k] = P_X * X_u + P_Y * Y_u, P_X * X_v + P_Y * Y_v
         out[3, k], out[4, k], out[5, k], out[6, k] = by_blur / s, X, Y, depth
+
+
+@njit(cache=True, error_model="numpy")
+def derivatives(at, told, light, s, J):
+    """Write the derivatives of the greys by the homography's numbers, the blur and the bends (15), and by the planes of
+    white and black and the light's curves (9), into ``J`` (k, 24): at pixels ``at`` (k, 2) px, of which `blurred_code`
+    ``told`` (7, k), in a ``light`` (9,) and with a blur of ``s`` px."""
+    for k in range(len(at)):
+        u, v, P, X, Y = at[k, 0], at[k, 1], told[0, k], told[4, k], told[5, k]
+        contrast = light[0] - light[3] + u * (light[1] - light[4]) + v * (light[2] - light[5])
+        # what moves a module to another place lets the pixel see a place that lies the other way
+        by_u, by_v = -contrast * told[1, k], -contrast * told[2, k]
+        H_u, H_v = by_u / told[6, k], by_v / told[6, k]
+        farther = H_u * u + H_v * v
+        J[k, 0], J[k, 1], J[k, 2] = H_u * X, H_u * Y, H_u
+        J[k, 3], J[k, 4], J[k, 5] = H_v * X, H_v * Y, H_v
+        J[k, 6], J[k, 7], J[k, 8] = -farther * X, -farther * Y, contrast * told[3, k]
+        J[k, 9], J[k, 11], J[k, 13] = X * X * by_u, X * Y * by_u, Y * Y * by_u
+        J[k, 10], J[k, 12], J[k, 14] = X * X * by_v, X * Y * by_v, Y * Y * by_v
+        to_u, to_v = s * s * told[1, k], s * s * told[2, k]
+        J[k, 15], J[k, 16], J[k, 17] = P, P * u + to_u, P * v + to_v
+        J[k, 18], J[k, 19], J[k, 20] = 1.0 - P, (1.0 - P) * u - to_u, (1.0 - P) * v - to_v
+        level = (P * light[0] + (1.0 - P) * light[3]) / max(abs(light[0]), 1.0)
+        J[k, 21], J[k, 22], J[k, 23] = level * u * u, level * u * v, level * v * v
