@@ -9,6 +9,9 @@ import pytest
 import trimesh
 import yaml
 
+from livedeform.common.experiment.schema import Experiment, ProbeShape
+from livedeform.common.experiment.yaml_file import load_experiment
+
 DOCUMENT = """
 version: 1
 name: block
@@ -54,6 +57,16 @@ def folder(tmp_path: Path) -> Path:
     (path / "right.yaml").write_text("")
     (path / "experiment.yaml").write_text(DOCUMENT)
     return path
+
+
+@pytest.fixture
+def experiment(folder: Path) -> Experiment:
+    """The block, scanned as it is held, and a ball that presses it."""
+    loaded = load_experiment(folder, geometry=False)
+    assert loaded.probe is not None
+    phantom = loaded.phantom.model_copy(update={"configuration": "loaded", "scan_gravity": loaded.phantom.gravity})
+    probe = loaded.probe.model_copy(update={"shape": ProbeShape(sphere=0.01)})
+    return loaded.model_copy(update={"phantom": phantom, "probe": probe})
 
 
 @pytest.fixture

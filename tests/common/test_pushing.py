@@ -14,7 +14,7 @@ from livedeform.common.checks.contact.pushing import check_pushing, pushed
 from livedeform.common.checks.probe_path import ProbeRecord
 from livedeform.common.checks.recorded import check_recording
 from livedeform.common.experiment.plausibility import read_body
-from livedeform.common.experiment.schema import Experiment, ProbeShape
+from livedeform.common.experiment.schema import Experiment
 from livedeform.common.experiment.surface import Surface
 from livedeform.common.experiment.yaml_file import load_experiment
 from livedeform.common.types import Array, Pose, Wrench
@@ -27,16 +27,6 @@ PERIOD, STIFFNESS = 0.02, 400.0  # s and N/m
 SECONDS = np.arange(0.0, 12.0, PERIOD)
 DOWN = np.array([1.0, 0.0, 0.0, 0.0])
 START_NS = 1_700_000_000_000_000_000
-
-
-@pytest.fixture
-def experiment(folder: Path) -> Experiment:
-    """The block, scanned as it is held, and a ball that presses it."""
-    loaded = load_experiment(folder, geometry=False)
-    assert loaded.probe is not None
-    phantom = loaded.phantom.model_copy(update={"configuration": "loaded", "scan_gravity": loaded.phantom.gravity})
-    probe = loaded.probe.model_copy(update={"shape": ProbeShape(sphere=0.01)})
-    return loaded.model_copy(update={"phantom": phantom, "probe": probe})
 
 
 def way(deepest: float = 0.006, sideways: float = 0.0, hang: float = 0.005) -> Array:

@@ -16,9 +16,8 @@ from livedeform.common.checks.finding import Finding
 from livedeform.common.checks.probe_path import ProbeRecord
 from livedeform.common.checks.recorded import check_recording
 from livedeform.common.checks.tared import check_tared
-from livedeform.common.experiment.schema import Experiment, ProbeShape
+from livedeform.common.experiment.schema import Experiment
 from livedeform.common.experiment.surface import Surface
-from livedeform.common.experiment.yaml_file import load_experiment
 from livedeform.common.types import Array, MarkerFrame, Pose, Wrench
 
 BLOCK = trimesh.creation.box((0.06, 0.06, 0.05))  # as the experiment of `conftest.folder`
@@ -55,16 +54,6 @@ def recorded(depth: Array, force: Array, tilt: Array | float = 0.0) -> Recording
 
 def said(recording: Recording, experiment: Experiment) -> list[Finding]:
     return [f for f in check_tared(ProbeRecord(recording, experiment, BODY)) if f.level != "NOTE"]
-
-
-@pytest.fixture
-def experiment(folder: Path) -> Experiment:
-    """The block, scanned as it is held, and a ball that presses it."""
-    loaded = load_experiment(folder, geometry=False)
-    assert loaded.probe is not None
-    phantom = loaded.phantom.model_copy(update={"configuration": "loaded", "scan_gravity": loaded.phantom.gravity})
-    probe = loaded.probe.model_copy(update={"shape": ProbeShape(sphere=0.01)})
-    return loaded.model_copy(update={"phantom": phantom, "probe": probe})
 
 
 @pytest.mark.parametrize("level", [(0.0, 0.0, -1.5), (0.3, 0.0, 0.0), (-0.15, 0.15, 0.1), (0.0, 0.0, 40.0)])

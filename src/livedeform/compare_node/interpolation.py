@@ -31,7 +31,8 @@ __all__ = ["Interpolated", "InterpolationBound", "interpolate", "neighbour", "re
 
 QUICK = 4.0  # by how much faster a marker is at most within a bracket than its change of velocity, and by how much the
 # change on one side of a bracket is larger at most than that on the other
-EDGES = np.geomspace(1e-9, 10.0, 2304)  # m: classes one percent wide, of which a percentile is told for hours on end
+# m: nothing, and classes one percent wide, of which a percentile is told for hours on end
+EDGES = np.concatenate([[0.0], np.geomspace(1e-9, 10.0, 2304)])
 Bracket = tuple[PredictedMarkers | None, PredictedMarkers, PredictedMarkers]
 """Two predictions, and a neighbour before them where one is known."""
 
@@ -83,8 +84,8 @@ class InterpolationBound:
     def __init__(self) -> None:
         self.value = float("nan")
         """The largest (m) over frames and markers; NaN where no frame was interpolated, or nothing is known of it."""
-        self._n, self._squares = 0, 0.0  # of every marker in every frame
-        self._classes = np.zeros(len(EDGES) + 1, np.int64)  # how many of them are below and between the EDGES
+        self._squares = 0.0  # of every marker in every frame
+        self._classes = np.zeros(len(EDGES) + 1, np.int64)  # how many of them are up to each of the EDGES, and beyond
         self._waiting: list[tuple[Bracket, int]] = []
 
     @property
@@ -92,14 +93,12 @@ class InterpolationBound:
         """Return what is known of all frames so far."""
         if not np.isfinite(self.value):
             return Interpolated()
-        at = int(np.searchsorted(np.cumsum(self._classes), 0.95 * self._n))
-        p95 = float(EDGES[min(at, len(EDGES) - 1)])
-        rare = self._classes[0] >= 0.95 * self._n
-        return Interpolated(self.value, max(float(np.sqrt(self._squares / self._n)), 0.0 if rare else p95))
+        up_to = np.cumsum(self._classes)
+        p95 = EDGES[min(int(np.searchsorted(up_to, 0.95 * up_to[-1])), len(EDGES) - 1)]
+        return Interpolated(self.value, float(max(np.sqrt(self._squares / up_to[-1]), p95)))
 
     def add_exact(self, n: int) -> None:
         """Take a frame of ``n`` markers that has a prediction of its own."""
-        self._n += n
         self._classes[0] += n
 
     def add(self, bracket: Bracket, later: Iterable[PredictedMarkers], stamp_ns: int) -> None:
@@ -123,7 +122,6 @@ class InterpolationBound:
         bounds = _bounds((*bracket, after), stamp_ns)
         if len(bounds):
             self.value = float(np.fmax(self.value, bounds.max()))
-            self._n += len(bounds)
             self._squares += float(bounds @ bounds)
             np.add.at(self._classes, np.searchsorted(EDGES, bounds), 1)
 
