@@ -219,15 +219,13 @@ def test_friction_with_the_support_changes_the_unloaded_shape(space, exact):
 @pytest.mark.slow
 @pytest.mark.parametrize(("friction", "names"), [(0.0, ["E", "tilt", "slip", "offset"]), (0.3, ["E", "slip", "mu"])])
 def test_a_support_that_slips_under_a_probe(space, exact, friction, names):
-    """As exact as on a support that holds: the springs of the contact give, by up to 0.5 % of the force. Steps are
-    below those of a path that rubs: beyond, some whole runs end in another equilibrium, 9e-4 N apart."""
+    """As exact as on a support that holds: the springs of the contact give, by up to 0.5 % of the force. Where a
+    probe rubs some whole runs end in another equilibrium, 9e-4 N apart: the median of several widths counts."""
     exact = replace(exact, max_updates=3000)
     physics = _on_friction(0.4, probe=Probe(Box(0.02, 0.012, 0.02, 0.002), friction=friction))
     stamps = [0, 200_000_000, 400_000_000]
-    poses = [Pose(k * 100_000_000, np.array([0.004 + 2.5e-4 * k, 0.0, 0.0296 - 4e-4 * k]), DOWN) for k in range(5)]
-    _check(
-        space, physics, names, poses, stamps, exact, bound=1.5e-2, H=2e-5, walk_settings=ROUGH, n=9 if friction else 1
-    )
+    poses = [Pose(k * 100_000_000, np.array([0.004 + 5e-4 * k, 0.0, 0.0296 - 4e-4 * k]), DOWN) for k in range(5)]
+    _check(space, physics, names, poses, stamps, exact, bound=1e-2, H=2e-5, walk_settings=ROUGH, n=9 if friction else 1)
 
 
 @pytest.mark.slow
