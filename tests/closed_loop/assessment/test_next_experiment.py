@@ -10,7 +10,15 @@ import pytest
 import toy
 from toy_loop import closed, toy_inputs
 
-from livedeform.closed_loop.assessment.next_experiment import NextExperiment, Proposal, apart_in, grows
+from livedeform.closed_loop.assessment import next_experiment
+from livedeform.closed_loop.assessment.next_experiment import (
+    NextExperiment,
+    Proposal,
+    apart_in,
+    feasible,
+    grows,
+    planned,
+)
 from livedeform.closed_loop.diagnosis import Diagnosis
 from livedeform.closed_loop.evidence.observation import Observation
 from livedeform.closed_loop.forward import Column, Run
@@ -85,6 +93,50 @@ def test_a_motion_that_tells_nothing_is_not_handed_out() -> None:
     assert proposal is not None and proposal.best is None and len(proposal.separation) == 6
     assert max(proposal.separation.values()) < 0.1  # measured 0.010
     assert "no feasible trajectory separates density from stiffness" in proposal.advice
+
+
+class Pushing(toy.ToyModel):
+    """A model of which a stiffness alone makes a force: 2 N on the probe, times its ratio."""
+
+    def run(
+        self, effects: Sequence[EffectValues], observations: Sequence[Observation], columns: Sequence[Column] = ()
+    ) -> list[Run]:
+        ratio = float(next((e.values["ratio"] for e in effects if e.name == "stiffness"), 1.0))
+        out = []
+        for o, run in zip(observations, super().run(effects, observations, columns), strict=True):
+            forces = np.tile([0.0, 0.0, -2.0 * ratio], (o.n_moments, 1))
+            by_log = [float(c.candidate.name == "stiffness") for c in columns]
+            out.append(replace(run, forces=forces, d_forces=forces[..., None] * np.array(by_log)))
+        return out
+
+
+@pytest.mark.parametrize("linear", [True, False])
+def test_a_force_that_is_recorded_tells_what_markers_cannot(linear: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A weight and a stiffness, which no press tells apart by markers: at most 0.1 sigma."""
+    if not linear:
+        monkeypatch.setattr(next_experiment, "grows", lambda added: False)
+    model = Pushing(toy.ToyBody(toy.markers()))
+    selection = diagnosed(Planning(toy.ToyBody(toy.markers()))).selection
+    with_forces = [replace(o, forces=np.zeros((o.n_moments, 3)), force_sigma=0.02) for o in selection.observations]
+    best = {}
+    for name, observations in (("markers", selection.observations), ("forces", with_forces)):
+        asked = replace(selection, observations=observations)
+        proposal = NextExperiment(toy.SETTINGS, model, inputs().reach).propose(asked, {"density": ("stiffness",)})
+        assert proposal is not None
+        best[name] = max(proposal.separation.values())
+    assert best["markers"] < 0.1
+    assert best["forces"] > 1.0
+
+
+def test_a_motion_is_planned_with_the_noise_of_the_middle_recording() -> None:
+    recorded = [toy.record([], seed=s, n=12, sigma=sigma) for s, sigma in enumerate((1e-4, 9e-4, 3e-4))]
+    (trajectory, *_) = feasible(inputs().reach, recorded[0].path[0], toy.SETTINGS.proposal)
+    plan = planned(trajectory, recorded, toy.SETTINGS.proposal)
+    assert plan.noise is recorded[2].noise
+    assert plan.forces is None
+    pushed = replace(recorded[1], forces=np.zeros((12, 3)), force_sigma=0.02)
+    plan = planned(trajectory, [recorded[0], pushed, recorded[2]], toy.SETTINGS.proposal)
+    assert plan.noise is recorded[2].noise and plan.forces is not None and plan.force_sigma == 0.02
 
 
 def test_what_was_recorded_is_solved_at_any_price() -> None:

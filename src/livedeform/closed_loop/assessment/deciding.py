@@ -86,7 +86,7 @@ class Deciding:
             return {}
         left: dict[str, int] = {}
         trajectories = feasible(self.reach, self.reach.top, self.settings.proposal)
-        plans = [planned(t, self.selection.observations[0], self.settings.proposal) for t in trajectories]
+        plans = [planned(t, self.selection.observations, self.settings.proposal) for t in trajectories]
         model, columns = FittedModel(self.selection.model.uncertain), dictionary_columns(self.candidates)
         runs = self.forward.run([], plans, [*columns, *model.allowed_columns])
         for trajectory, plan, run in zip(trajectories, plans, runs, strict=True):

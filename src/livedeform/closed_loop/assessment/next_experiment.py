@@ -106,7 +106,7 @@ class NextExperiment:
         others = [a for a in selection.added if a.candidate.name not in names]
         rough = (selection.first is not None and selection.first.run.rough) or not all(grows(a) for a in others)
         known = refined[names[1]].fit.sigma  # what the recordings already say of the rival
-        plans = [planned(t, selection.observations[0], self.settings.proposal) for t in trajectories]
+        plans = [planned(t, selection.observations, self.settings.proposal) for t in trajectories]
         out: dict[str, float] = {}
         each = apart_in(self.forward, [a.values for a in others], (first, second), plans, rough=rough)
         for plan, apart in zip(plans, each, strict=True):
@@ -125,7 +125,7 @@ class NextExperiment:
         its run has, has adapted itself within the sigmas (p,) ``known`` of it."""
         plan = FittedModel(replace(model.uncertain, always=()))
         problem, J = ProblemFactory([observation], self.settings.allowance).at(plan, apart.rival, columns)
-        d = problem.rows.take(apart.points)
+        d = problem.rows.take(apart.points, apart.forces)
         marginal = problem.marginal
         dw, Jw = marginal(np.nan_to_num(d)), marginal(J)
         A = Jw.T @ Jw + np.diag(1.0 / np.maximum(known, TINY) ** 2)
@@ -134,10 +134,11 @@ class NextExperiment:
 
 
 class ModelsApart(NamedTuple):
-    """Hold by how much one model's ``points`` (k, m, 3) m are off its rival's, and a run of the ``rival``, or near it,
-    with its columns."""
+    """Hold by how much one model's ``points`` (k, m, 3) m and ``forces`` (k, 3) N, if it tells any, are off its
+    rival's, and a run of the ``rival``, or near it, with its columns."""
 
     points: Array
+    forces: Array | None
     rival: Run
 
 
@@ -160,21 +161,28 @@ def apart_in(
     columns = columns_of([second])
     if rough or not all(grows(a) for a in members):
         runs = [forward.run([*others, a.values], plans, c) for a, c in ((first, ()), (second, columns))]
-        return [
-            ModelsApart(a.points - b.points, b) if a.whole and b.whole else None for a, b in zip(*runs, strict=True)
-        ]
+        return [_between(a, b) if a.whole and b.whole else None for a, b in zip(*runs, strict=True)]
     (half, up), (rival, down) = halfway(first), halfway(second)
     between = forward.run([*others, half.values, rival.values], plans, columns_of([half, rival]))
-    n, step = len(first.z), 2.0 * np.concatenate([up, -down])
+    step = 2.0 * np.concatenate([up, -down])
     of_shape = np.where(down != 0.0, 1.0, 2.0)  # what it shows of its shape grows with its size
-    return [
-        ModelsApart(
-            run.d_points @ step, replace(run, forces=None, d_points=run.d_points[..., n:] * of_shape, d_forces=None)
-        )
-        if run.whole
-        else None
-        for run in between
-    ]
+    return [_by_one_run(run, step, of_shape) if run.whole else None for run in between]
+
+
+def _between(a: Run, b: Run) -> ModelsApart:
+    """Return by how much the run ``a`` is off that of the rival ``b``."""
+    forces = None if a.forces is None or b.forces is None else a.forces - b.forces
+    return ModelsApart(a.points - b.points, forces, b)
+
+
+def _by_one_run(run: Run, step: Array, of_shape: Array) -> ModelsApart:
+    """Return by how much models are apart along a ``step`` (n + p,) of the run's columns, of which the last p are the
+    rival's, to be scaled as ``of_shape`` (p,) says."""
+    own = len(step) - len(of_shape)
+    forces = None if run.d_forces is None else run.d_forces @ step
+    d_forces = None if run.d_forces is None else run.d_forces[..., own:] * of_shape
+    rival = replace(run, d_points=run.d_points[..., own:] * of_shape, d_forces=d_forces)
+    return ModelsApart(run.d_points @ step, forces, rival)
 
 
 def grows(added: Added) -> bool:
@@ -283,8 +291,11 @@ def _poses(stops: Sequence[Stop], period: float) -> tuple[Pose, ...]:
     return tuple(poses)
 
 
-def planned(trajectory: ProbeTrajectory, like: Observation, settings: ProposalSettings) -> Observation:
-    """An observation of a motion that has not been made, with the noise of a recording that has."""
+def planned(trajectory: ProbeTrajectory, recorded: Sequence[Observation], settings: ProposalSettings) -> Observation:
+    """An observation of a motion that has not been made, with the noise of the middle one of those that have, and
+    with forces if one of them has."""
+    like = sorted(recorded, key=lambda o: float(np.trace(np.nanmedian(o.noise.covariance, axis=0))))[len(recorded) // 2]
+    force_sigmas = [o.force_sigma for o in recorded if o.forces is not None and np.isfinite(o.force_sigma)]
     stamps = np.array([p.stamp_ns for p in trajectory.poses], np.int64)
     pick = np.unique(np.linspace(0, len(stamps) - 1, settings.moments).round().astype(int))
     m = len(like.ids)
@@ -307,8 +318,8 @@ def planned(trajectory: ProbeTrajectory, like: Observation, settings: ProposalSe
         weights=np.ones(n),
         poses=tuple(Pose(p.stamp_ns + shift, p.position, p.orientation_xyzw) for p in poses),
         velocities=np.zeros((n, 3)),
-        forces=None,
-        force_sigma=float("nan"),
+        forces=np.zeros((n, 3)) if force_sigmas else None,
+        force_sigma=float(np.median(force_sigmas)) if force_sigmas else float("nan"),
         blocks=np.zeros(n, int),
         phases=np.where(np.arange(n) < 2, "rest", "press"),
         presses=np.where(np.arange(n) < 2, 0, 1),
