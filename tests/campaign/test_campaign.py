@@ -15,6 +15,7 @@ import small_laboratory as lab
 
 pytest.importorskip("distributed")
 
+import livedeform
 from livedeform.campaign import work as work_module
 from livedeform.campaign.campaign import CampaignOptions, alone_in, run_campaign
 from livedeform.campaign.jobs import Job, jobs_of
@@ -138,6 +139,7 @@ def test_errors_in_the_middle_leave_the_others_done_and_are_done_again_when_aske
     )
     rows = list(read_table(out))
     assert [r["status"] for r in rows] == ["done", "done", "failed", "failed", "done", "failed"]
+    assert [r["version"] for r in rows if r["status"] == "done"] == 3 * [livedeform.__version__]
     assert "densitty" in rows[2]["problem"] and "take-01.mcap" in rows[5]["problem"]
     wrong.write_text(right)
     broken.write_bytes(whole)

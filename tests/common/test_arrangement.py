@@ -243,3 +243,14 @@ def test_far_away_it_is_an_error_that_says_why(folder: Path) -> None:
     )
     assert error.text.endswith("turned by 180 degrees") and "T_phantom_tracker" in error.remedy
     assert not [f for f in found if f.level == "WARN" and "markers.csv" in f.text]
+
+
+@pytest.mark.parametrize("pattern", ["rings", "scattered"])
+def test_a_recording_of_other_markers_is_an_error(pattern: str, folder: Path) -> None:
+    """The ids are those of the experiment, and the markers within its body; nothing else fits."""
+    places = PATTERNS[pattern]
+    lower, upper = np.array([-0.03, -0.03, 0.0]), np.array([0.03, 0.03, 0.05])
+    other = np.random.default_rng(11).uniform(lower, upper, places.shape)
+    (found,) = check_arrangement(ProbeRecord(recorded(other), experiment_of(folder, places, **STIFF), BODY))
+    assert found.level == "ERROR" and "a recording of another body or with other ids" in found.text
+    assert found.remedy

@@ -157,6 +157,38 @@ def test_sigma_companions(change):
 
 
 @pytest.mark.parametrize(
+    ("key", "value", "said"),
+    [
+        ("phantom.material.youngs_modulus", "4000 Pa", "'4000 Pa'"),
+        ("phantom.density", True, "'true' is not a number"),
+        ("probe.edge_radius", "2 mm", "'2 mm'"),
+    ],
+)
+def test_a_wrong_number_is_named_with_and_without_its_standard_deviation(change, key, value, said):
+    change(f"{key}_sigma", 1e-4)
+    line = complaint(change(key, value))
+    assert said in line and key.rpartition(".")[2] in line and "is no physical quantity" not in line
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "said"),
+    [
+        ("phantom.gravity", [0.0, -9.81], "phantom.gravity: has too few entries, 2"),
+        ("phantom.gravity", [0.0, 0.0, -9.81, 0.0], "phantom.gravity: has too many entries"),
+        ("phantom.support", [], "phantom.support: should have an entry"),
+    ],
+)
+def test_lists_of_another_length_are_said_in_plain_words(change, key, value, said):
+    assert said in complaint(change(key, value))
+
+
+def test_a_tab_is_called_so(folder):
+    document = (folder / "experiment.yaml").read_text()
+    (folder / "experiment.yaml").write_text(document.replace("  density", "\tdensity"))
+    assert "write spaces instead of tabs" in complaint(folder)
+
+
+@pytest.mark.parametrize(
     ("key", "value"),
     [
         ("version_sigma", 1), ("name_sigma", 1.0), ("loads_sigma", 1.0), ("effects_sigma", 1.0), ("probe_sigma", 1.0),
@@ -204,6 +236,13 @@ def test_what_is_in_another_unit_by_all_likelihood_is_doubted(change, key, value
 def test_what_is_usual_is_not_doubted(change, key, value):
     experiment = load_experiment(change(key, value))
     assert all(f.level == "NOTE" for f in check_declared(experiment, read_body(experiment)))
+
+
+def test_two_markers_at_one_place_are_doubted(folder):
+    (folder / "markers.csv").write_text("id,x,y,z\n4,0.03,0,0.02\n9,0,0.03,0.02\n6,0.03,0,0.02\n")
+    experiment = load_experiment(folder)
+    (found,) = [f for f in check_declared(experiment, read_body(experiment)) if "one place" in f.text]
+    assert "markers 4 and 6 at one place" in found.text and found.doubts
 
 
 def material(model, **constants):

@@ -1,10 +1,14 @@
 """Distances from and containment in closed surfaces, against shapes whose answers are known."""
 
+import re
+from pathlib import Path
+
 import numpy as np
 import pytest
 import trimesh
 
-from livedeform.common.experiment.surface import Surface
+from livedeform.common.errors import MeshError
+from livedeform.common.experiment.surface import Surface, read_surface
 
 
 def ball(radius: float = 0.05) -> Surface:
@@ -64,3 +68,16 @@ def test_a_box_beside_a_slanted_triangle_does_not_meet_it():
     for at, meets in ((0.62, False), (0.57, True), (0.5, False)):  # of the sphere along (1, 1, 1): 0.577
         middle = np.full(3, at)
         assert surface.meets_box(middle - 0.01, middle + 0.01) == meets, at
+
+
+def test_a_hole_is_refused_with_its_place(tmp_path: Path) -> None:
+    """Two holes in a ball, the larger at its top; in the file's unit."""
+    mesh = trimesh.creation.icosphere(subdivisions=4, radius=50.0)
+    centres = mesh.triangles_center
+    kept = (centres[:, 2] < 45.0) & (centres[:, 0] > -49.5)
+    mesh.update_faces(kept)
+    mesh.export(tmp_path / "ball.stl")
+    with pytest.raises(MeshError, match="the largest of 2 holes is about") as caught:
+        read_surface(tmp_path / "ball.stl", "mm")
+    x, y, z = map(float, re.findall(r"about \((.*)\) in the file", str(caught.value))[0].split(","))
+    assert abs(z - 45.0) < 2.0 and np.hypot(x, y) < 2.0

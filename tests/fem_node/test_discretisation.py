@@ -86,3 +86,13 @@ def test_the_pose_is_the_probes_own():
 def test_of_markers_that_do_not_move_no_share_is_said(motion: float, said: str):
     line = DiscretisationError(1e-4, 2e-4, motion, 0, (10, 80), np.zeros((1, 3))).line()
     assert said in line and "nan" not in line
+
+
+def test_where_a_probe_moves_no_marker_their_motion_is_the_weights():
+    """A probe that stays in the air: the error of the sag is not without a motion to compare it with."""
+    away = [replace(p, position=np.array([0.0, 0.0, 0.06])) for p in POSES]
+    heavy = body(block_mesh(SIZE, (4, 4, 3)), probe=True)
+    heavy.physics = replace(heavy.physics, density=1000.0)
+    found = discretisation_error(heavy, Recorded("r", [p.stamp_ns for p in away], 0, away))
+    sag = np.sqrt(np.mean(np.sum((found.markers - MARKERS) ** 2, axis=1)))
+    assert found.motion == pytest.approx(sag) and 0.0 < found.share < 1.0

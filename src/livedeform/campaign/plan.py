@@ -15,7 +15,7 @@ from pydantic import BeforeValidator, Field, ValidationError
 
 from livedeform.closed_loop.candidates import check_known
 from livedeform.common.errors import InputError
-from livedeform.common.experiment.mistakes import IN_WORDS, first_mistake, in_words, locate
+from livedeform.common.experiment.mistakes import first_mistake, in_words, locate
 from livedeform.common.experiment.schema import Section, not_bool
 from livedeform.common.experiment.yaml_file import FILE_NAME
 from livedeform.common.yaml_text import parse_settings
@@ -127,7 +127,7 @@ def _read_file(file: Path) -> CampaignFile:
         assert node is not None  # an empty file has no mistake
         first = first_mistake(error)
         keys, line = locate(node, first["loc"])
-        what, remedy = in_words(first, "add it; docs/campaigns.md has every key", IN_WORDS)
+        what, remedy = in_words(first, "add it; docs/campaigns.md has every key")
         raise InputError(what, where=f"{file}:{line}: {keys}".removesuffix(": "), remedy=remedy) from error
     if settings.diagnose is not None and settings.diagnose.candidates is not None:
         try:

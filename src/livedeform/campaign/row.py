@@ -12,6 +12,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+import livedeform
 from livedeform.closed_loop.assessment.verdict import rivals_of
 from livedeform.closed_loop.candidates import all_effects
 from livedeform.common.effect import significant
@@ -51,7 +52,8 @@ INTERVAL = 1.96  # sigmas of 95 %
 def row_of(metrics: Mapping[str, Any] | None, diagnosis: Mapping[str, Any] | None, times: tuple[int, int]) -> Row:
     """Put the row together; ``times``: the recording's first and last stamp in ns. What was not done is None."""
     out: Row = dict.fromkeys(MEASURED.names)
-    out |= {"status": "done", "started_ns": times[0], "duration_s": (times[1] - times[0]) * 1e-9}
+    out |= {"status": "done", "version": livedeform.__version__}
+    out |= {"started_ns": times[0], "duration_s": (times[1] - times[0]) * 1e-9}
     if metrics is not None:
         out |= _of_run(metrics)
     if diagnosis is not None:

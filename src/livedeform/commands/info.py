@@ -88,7 +88,7 @@ def _show(report: Report) -> None:
             4,
         )
     for finding in report.findings:
-        typer.echo(f"{finding.level:6}{finding.text}")
+        typer.echo(f"{finding.level:6}{finding.text}" + (f"; {finding.remedy}" if finding.remedy else ""))
     typer.echo("sound" if report.sound else "cannot be used as it is")
 
 

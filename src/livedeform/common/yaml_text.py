@@ -38,7 +38,9 @@ def parse_yaml(text: str, where: str) -> tuple[yaml.Node | None, Any]:
     except yaml.MarkedYAMLError as error:
         line = error.problem_mark.line + 1 if error.problem_mark else 1
         what = f"not valid YAML, {error.problem or error}"
-        raise InputError(what, where=f"{where}:{line}", remedy="look at brackets, colons and indentation") from error
+        tab = "'\\t'" in what
+        remedy = "write spaces instead of tabs" if tab else "look at brackets, colons and indentation"
+        raise InputError(what, where=f"{where}:{line}", remedy=remedy) from error
     except yaml.YAMLError as error:
         what = f"not valid YAML, {' '.join(str(error).split())}"
         raise InputError(what, where=where, remedy="save it as plain UTF-8 text") from error

@@ -61,7 +61,7 @@ class DiscretisationError:
 
 def discretisation_error(model: PhantomModel, recorded: Recorded) -> DiscretisationError:
     """Estimate the elements' error of the model's markers at the last moment of what is ``recorded``; their motion is
-    from the first one on, and without a probe from where they were scanned.
+    from the first one on, and without a probe, or where that moves none, from where they were scanned.
 
     The body is taken without relaxation, plastic set and inertia: these change little of what its elements get wrong,
     and would want its whole history on both meshes. Friction stays: without its hold a slender body may lean away.
@@ -79,7 +79,9 @@ def discretisation_error(model: PhantomModel, recorded: Recorded) -> Discretisat
     after = _markers(finer, physics, recorded)
     moving = ~markers.still
     error = OF_CHANGE * np.linalg.norm((after - before)[-1, moving], axis=1)
-    motion = np.linalg.norm((before[-1] - (markers.points if pose is None else before[0]))[moving], axis=1)
+    motion = np.linalg.norm((before[-1] - before[0])[moving], axis=1)
+    if pose is None or not motion.any():
+        motion = np.linalg.norm((before[-1] - markers.points)[moving], axis=1)
     unknowns, stamp_ns = (own.space.n_dof, finer.space.n_dof), int(recorded.stamps_ns[-1])
     return DiscretisationError(_rms(error), float(error.max()), _rms(motion), stamp_ns, unknowns, before[-1])
 

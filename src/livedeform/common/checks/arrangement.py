@@ -248,6 +248,8 @@ def _other_distances(given: Arrangement) -> list[Finding]:
     if misfit <= SOFTER * given.limit:
         return []
     text = f"the distances between the markers are not those of markers.csv ({1e3 * misfit:.3g} mm, rms, are left)"
+    if misfit > HALF * given.spread:  # as of other markers altogether: no ids that are told above make them fit
+        return [Finding("ERROR", f"{text}: a recording of another body or with other ids", OF_IDS)]
     return [Finding("WARN", text, f"compare frame, unit and ids: {OF_IDS}", doubts=True)]
 
 

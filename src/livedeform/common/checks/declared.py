@@ -31,6 +31,7 @@ def check_declared(experiment: Experiment, body: Surface) -> list[Finding]:
         *_gravity(experiment),
         *_tilt(experiment),
         *_large_errors(experiment, body),
+        *_same_places(experiment),
         *_probe_frame(experiment),
         *check_held(experiment, body),
         *_unused(experiment),
@@ -91,6 +92,19 @@ def _large_errors(experiment: Experiment, body: Surface) -> list[Finding]:
         for name, error in said
         if error > LARGE * body.diagonal
     ]
+
+
+def _same_places(experiment: Experiment) -> list[Finding]:
+    """Doubt two markers at one place, as after a line that was copied."""
+    places, ids = experiment.markers.points, experiment.markers.ids
+    _, first, again = np.unique(places, axis=0, return_index=True, return_inverse=True)
+    doubled = np.flatnonzero(first[again.ravel()] != np.arange(len(ids)))
+    if not len(doubled):
+        return []
+    k = doubled[0]
+    more = f", and {len(doubled) - 1} more such" if len(doubled) > 1 else ""
+    text = f"markers.csv has markers {ids[first[again.ravel()[k]]]} and {ids[k]} at one place{more}"
+    return [Finding("WARN", text, "correct the place of one of them", doubts=True)]
 
 
 def _tilt(experiment: Experiment) -> list[Finding]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import yaml
 from pydantic import ValidationError
@@ -14,6 +14,7 @@ IN_WORDS = {  # what pydantic's types of mistakes are called, and what helps
     "dict_type": ("should be a mapping", "write keys with their values"),
     "tuple_type": ("should be a list", "write it in brackets"),
     "too_short": ("should have an entry", "add one"),
+    "too_long": ("has too many entries", "leave out what is too much"),
     "string_type": ("should be a text", "write it in quotation marks"),
 }
 
@@ -25,18 +26,17 @@ def first_mistake(error: ValidationError) -> ErrorDetails:
     return next(unknown, reports[0])
 
 
-def in_words(
-    mistake: ErrorDetails, of_missing: str, others: Mapping[str, tuple[str, str]] | None = None
-) -> tuple[str, str]:
-    """Return what is wrong and the remedy; ``of_missing``: that for a missing key. ``others`` says what pydantic's own
-    types of mistakes are called and what helps."""
+def in_words(mistake: ErrorDetails, of_missing: str) -> tuple[str, str]:
+    """Return what is wrong and the remedy; ``of_missing``: that for a missing key."""
     context = mistake.get("ctx", {})
     if mistake["type"] == "livedeform":
         return context["what"], context["remedy"]
+    if mistake["type"] == "missing" and isinstance(mistake["loc"][-1], int):
+        return f"has too few entries, {len(mistake['input'])}", "write all of them"
     if mistake["type"] == "missing":
         return f"key '{mistake['loc'][-1]}' is missing", of_missing
     own = mistake["msg"][:1].lower() + mistake["msg"][1:], "correct the value"
-    message, remedy = (others or {}).get(mistake["type"], own)
+    message, remedy = IN_WORDS.get(mistake["type"], own)
     shown = repr(mistake["input"])
     shown = shown if len(shown) < MOST_SHOWN else shown[: MOST_SHOWN - 3] + "..."
     return f"{message}, but it is {shown}", remedy

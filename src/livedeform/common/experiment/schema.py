@@ -151,7 +151,7 @@ class Section(BaseModel):
         sigmas = {}
         for key in [k for k in values if isinstance(k, str) and k.endswith(SIGMA)]:
             quantity = key.removesuffix(SIGMA)
-            if quantity in cls._quantities(values):
+            if quantity in cls._quantities(values) or (quantity in values and cls._is_wrong_number(quantity, values)):
                 sigmas[quantity] = _read_sigma(key, values.pop(key))
             elif quantity in values and quantity in cls.model_fields:
                 remedy = f"leave it out; a diagnosis uses those of {', '.join(USED_SIGMAS)}"
@@ -168,6 +168,11 @@ class Section(BaseModel):
     def _is_of_numbers(cls, key: Any) -> bool:
         """Return whether a key holds numbers: a field that does, a companion, or a setting of its own."""
         return key not in cls.model_fields or "float" in str(cls.model_fields[key].annotation)
+
+    @classmethod
+    def _is_wrong_number(cls, key: str, values: Mapping[str, Any]) -> bool:
+        """Return whether a field of numbers has something else, of which it will tell."""
+        return key in cls.model_fields and cls._is_of_numbers(key) and isinstance(values[key], str | bool)
 
     @classmethod
     def _keys(cls) -> list[str]:

@@ -7,6 +7,8 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 
 from livedeform.common.errors import MeshError
 from livedeform.common.types import Array
@@ -103,10 +105,10 @@ def read_surface(path: Path, unit: str = "m") -> Surface:
             f"cannot be read as a surface ({error})", where=str(path), remedy="write it as STL, OBJ or PLY"
         ) from error
     if not isinstance(loaded, trimesh.Trimesh) or len(loaded.faces) == 0:
-        raise MeshError("holds no triangles", where=str(path), remedy="export the surface as triangles")
+        raise MeshError("holds no triangles", where=str(path), remedy="export the surface as triangles, whole")
     loaded.merge_vertices(merge_tex=True, merge_norm=True)
     loaded.update_faces(loaded.nondegenerate_faces())
-    check_closed(np.asarray(loaded.faces), path)
+    check_closed(np.asarray(loaded.vertices), np.asarray(loaded.faces), path)
     if not loaded.is_winding_consistent or loaded.volume < 0:
         trimesh.repair.fix_normals(loaded, multibody=True)
     vertices = np.asarray(loaded.vertices, float) * METRES_PER_UNIT[unit]
@@ -143,22 +145,35 @@ def _boundary(points: Array, tets: NDArray[np.int64]) -> NDArray[np.int64]:
     return np.asarray(faces[first[count == 1]], np.int64)
 
 
-def check_closed(triangles: NDArray[np.int64], path: Path) -> None:
-    """Every edge of a closed surface belongs to an even number of triangles; ``MeshError`` with the count if not."""
+def check_closed(vertices: Array, triangles: NDArray[np.int64], path: Path) -> None:
+    """Every edge of a closed surface belongs to an even number of triangles; if not, ``MeshError`` with the count, and
+    with the place of the largest hole in the file's unit (``vertices`` (n, 3))."""
     refuse_loose(triangles, str(path))
-    count = _triangles_at_edges(triangles)
-    n_open = int((count % 2 == 1).sum())
-    if n_open:
+    edges, count = _edges_of(triangles)
+    is_open = count % 2 == 1
+    if is_open.any():
+        holes, (x, y, z) = _holes(vertices, edges[is_open])
+        where = "the hole" if holes == 1 else f"the largest of {holes} holes"
         raise MeshError(
-            f"the surface is not closed: {n_open} of {len(count)} edges lie on a hole's border",
+            f"the surface is not closed: {is_open.sum()} of {len(count)} edges lie on a hole's border; {where} is "
+            f"about ({x:.4g}, {y:.4g}, {z:.4g}) in the file",
             where=str(path),
             remedy="close the holes, for example with MeshLab's 'Close Holes'",
         )
 
 
+def _holes(vertices: Array, edges: NDArray[np.int64]) -> tuple[int, Array]:
+    """Return how many holes have the border ``edges`` (e, 2), and the middle (3,) of the one with the most of them."""
+    graph = coo_matrix((np.ones(len(edges)), edges.T), shape=(len(vertices), len(vertices)))
+    of_vertex = connected_components(graph, directed=False)[1][edges[:, 0]]
+    numbers, counts = np.unique(of_vertex, return_counts=True)
+    border = vertices[edges[of_vertex == numbers[counts.argmax()]]]
+    return len(numbers), np.asarray(border.reshape(-1, 3).mean(axis=0))
+
+
 def refuse_loose(triangles: NDArray[np.int64], where: str) -> None:
     """``MeshError`` for triangles (k, 3) most of which hang together with no other: they have no holes to close."""
-    count = _triangles_at_edges(triangles)
+    _, count = _edges_of(triangles)
     loose = int((count == 1).sum())
     if loose > LOOSE * len(count):
         raise MeshError(
@@ -168,7 +183,9 @@ def refuse_loose(triangles: NDArray[np.int64], where: str) -> None:
         )
 
 
-def _triangles_at_edges(triangles: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return how many triangles (e,) each edge belongs to."""
+def _edges_of(triangles: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return the edges (e, 2), by the numbers of their ends, and how many triangles (e,) each belongs to."""
     edges = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2).astype(np.int64), axis=1)
-    return np.asarray(np.unique(edges @ [int(triangles.max()) + 1, 1], return_counts=True)[1], np.int64)
+    n = int(triangles.max()) + 1
+    codes, counts = np.unique(edges @ [n, 1], return_counts=True)
+    return np.column_stack([codes // n, codes % n]), np.asarray(counts, np.int64)

@@ -23,7 +23,7 @@ from rclpy.subscription import Subscription
 from livedeform.common.errors import LivedeformError
 from livedeform.common.processes import INTERRUPTED, end
 from livedeform.common.ros.messages import from_time, to_diagnostics
-from livedeform.common.ros.session import LONG_QUEUE, quality, run_node
+from livedeform.common.ros.session import LONG_QUEUE, heard_quality, quality, run_node
 from livedeform.common.ros.traffic import Traffic
 from livedeform.common.stamps import StampGate
 
@@ -59,7 +59,7 @@ class CountingNode(Node):
         raw: bool = False,
         gate: bool = False,
     ) -> None:
-        """Call ``handle(message)`` (bytes if ``raw``) for every message; ``qos`` None: as the table of topics says.
+        """Call ``handle(message)`` (bytes if ``raw``) for every message; ``qos`` None: `heard_quality`.
 
         With ``gate``, of those with a header, not for one whose stamp is far from the others' (`StampGate`).
         """
@@ -80,7 +80,7 @@ class CountingNode(Node):
             kind,
             topic,
             callback,  # type: ignore[arg-type]  # rclpy's hints do not know the second argument
-            copy(qos or quality(topic)),  # rclpy writes overrides into it
+            copy(qos or heard_quality(topic)),  # rclpy writes overrides into it
             raw=raw,
             event_callbacks=SubscriptionEventCallbacks(incompatible_qos=self._refuses(topic, "publisher")),
             qos_overriding_options=QoSOverridingOptions.with_default_policies(),

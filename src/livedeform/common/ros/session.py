@@ -8,6 +8,7 @@ import signal
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from copy import copy
 from dataclasses import fields, is_dataclass
 from pathlib import Path
 from types import FrameType
@@ -25,14 +26,14 @@ from rclpy.utilities import ok, try_shutdown
 from livedeform.common.errors import InputError
 from livedeform.common.own_folder import own_folder
 from livedeform.common.processes import expendable, heard_at_once
-from livedeform.common.topics import LATCHED_DEPTH, TOPICS
+from livedeform.common.topics import COMPRESSED_IMAGES, IMAGES, LATCHED_DEPTH, TOPICS
 
 Parameters = TypeVar("Parameters")
 
 SEGMENT_BYTES = 64 * 1024 * 1024
 PROFILE_VARIABLE = "FASTRTPS_DEFAULT_PROFILES_FILE"
 
-QUEUE_DEPTH = 50  # a second and a half of pictures; a replay in lock step never fills it
+QUEUE_DEPTH = 50  # a second and a half of pictures; a replay never fills it with inputs: they come one by one
 RELIABLE = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=QUEUE_DEPTH, reliability=ReliabilityPolicy.RELIABLE)
 LATCHED = QoSProfile(
     history=HistoryPolicy.KEEP_LAST,
@@ -51,6 +52,16 @@ LONG_SENSOR = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=LONG_QUEUE, reli
 def quality(topic: str) -> QoSProfile:
     """Return the quality of service at which a topic is offered, from the table of topics."""
     return LATCHED if topic in TOPICS and TOPICS[topic].latched else RELIABLE
+
+
+def heard_quality(topic: str) -> QoSProfile:
+    """Return the quality of service at which a topic of the table is heard from who is reliable: as it is offered, but
+    with a queue, save for pictures, that holds what a node publishes within one callback. One prediction may tell the
+    errors of half a second of frames, and one pose the predictions of as many."""
+    profile = copy(quality(topic))
+    if topic in TOPICS and topic not in (*IMAGES, *COMPRESSED_IMAGES):
+        profile.depth = LONG_QUEUE
+    return profile
 
 
 _PROFILE = """<?xml version="1.0" encoding="UTF-8"?>

@@ -245,7 +245,7 @@ def _make_mesh(size, edge_radius: float) -> Shape:
         where, surface = str(size), read_surface(Path(size))
         size = surface.vertices, surface.triangles
     vertices, triangles = np.asarray(size[0], dtype=float), np.asarray(size[1], dtype=np.int64)
-    check_closed(triangles, Path(where))
+    check_closed(vertices, triangles, Path(where))
     across = float(np.linalg.norm(np.ptp(vertices, axis=0)))
     if not SMALLEST <= across <= LARGEST:
         raise MeshError(f"the probe is {across:.4g} m across", where=where, remedy="scale the file: it is in metres")

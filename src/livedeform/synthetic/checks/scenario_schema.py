@@ -13,7 +13,7 @@ import numpy as np
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 
 from livedeform.common.errors import InputError
-from livedeform.common.experiment.mistakes import IN_WORDS, first_mistake, in_words
+from livedeform.common.experiment.mistakes import first_mistake, in_words
 from livedeform.common.experiment.schema import (
     Effects,
     Length,
@@ -274,7 +274,7 @@ def _explained(error: ValidationError, values: Mapping[str, Any], source: str, u
     """Return the first mistake as one line."""
     first = first_mistake(error)
     keys = [*([under] if under else []), *_place(values, first["loc"])]
-    what, remedy = in_words(first, "add it", IN_WORDS)
+    what, remedy = in_words(first, "add it")
     return InputError(what, where=f"{source}: {'.'.join(keys)}".removesuffix(": "), remedy=remedy)
 
 
