@@ -17,9 +17,10 @@ from livedeform.stereo_node.pipeline import _rays_meet
 ORDERS = np.arange(3, 11)  # harmonics of the rim: those below are the ellipse
 
 
-def painted(seed, radius, uneven, n=36, cut=0.35, aspect=1.0, blur=0.7, fine=6):
+def painted(seed, radius, uneven, n=36, cut=0.35, aspect=1.0, blur=0.7, fine=6, deepest=1.0):
     """``n`` dark discs with rims ``uneven`` (rms, of the radius), seen with an ``aspect``; a share ``cut`` of them is
-    covered by a half plane as light as the ground, 0.05 to 1 radius deep. The picture, middles (n, 2), what is cut."""
+    covered by a half plane as light as the ground, 0.05 to ``deepest`` radii deep. The picture, middles (n, 2), and
+    what is cut."""
     rng = np.random.default_rng(seed)
     half, side = int(1.35 * radius) + 11, int(np.ceil(np.sqrt(n)))
     turn = rng.uniform(0, np.pi)
@@ -37,7 +38,7 @@ def painted(seed, radius, uneven, n=36, cut=0.35, aspect=1.0, blur=0.7, fine=6):
         angle = np.arctan2(flat[..., 1], flat[..., 0])
         rim = 1 + sum(a * np.cos(k * angle) + b * np.sin(k * angle) for k, a, b in zip(ORDERS, *waves, strict=True))
         drawn = np.where(np.hypot(flat[..., 0], flat[..., 1]) < radius * rng.uniform(0.95, 1.05) * rim, 50.0, 180.0)
-        angle, depth = rng.uniform(0, 2 * np.pi), rng.uniform(0.05, 1.0)
+        angle, depth = rng.uniform(0, 2 * np.pi), rng.uniform(0.05, deepest)
         across = np.array([np.cos(angle), np.sin(angle)])
         if covered[i]:
             drawn[off @ across > radius * np.linalg.norm(seen @ across) * (1 - depth)] = 180.0
@@ -78,6 +79,14 @@ def test_a_cut_of_a_small_disc_is_told_or_in_its_sigma(radius):
     (of_open, found), (of_covered, _) = measured(radius, 0.0, range(70000, 70003), fine=8).values()
     assert found == 1.0 and of_open < 1.5  # measured 1.21 and 1.07; all
     assert of_covered < 4.0  # measured 2.89 and 0.13
+
+
+@pytest.mark.parametrize("radius", [3.5, 4.0])
+def test_a_light_cut_of_a_small_disc_is_in_its_sigma(radius):
+    """It is too light to be told: middles off by 0.16 px were stated to 0.014."""
+    (of_open, found), (of_covered, _) = measured(radius, 0.0, range(71000, 71004), cut=0.3, deepest=0.25).values()
+    assert found == 1.0 and 0.5 < of_open < 2.0  # measured 1.37 and 1.46; all
+    assert of_covered < 3.0  # measured 1.34 and 0.95; without the outline's skewness 3.74 and 1.18
 
 
 @pytest.mark.parametrize(("radius", "aspect"), [(1.9, 1.0), (2.1, 1.5)])

@@ -15,6 +15,7 @@ from livedeform.common.types import Array, MarkerFrame, Pose
 from livedeform.stereo_node.camera.rig import StereoRig
 from livedeform.stereo_node.camera.setup import declared_camera_pose, rig_of
 from livedeform.stereo_node.effects import EFFECTS, Surface, View, correct_all
+from livedeform.stereo_node.effects.refraction import spread
 from livedeform.stereo_node.surfaces import PredictedSurfaces
 
 __all__ = ["MeasuringCorrection", "format_pose", "make_view", "parse_pose"]
@@ -122,8 +123,8 @@ class MeasuringCorrection:
         """Return the frame as a rig without these effects would have measured it; markers that are not declared are
         left out, and internal ones where the surface that refracts their rays is not known.
 
-        The covariances are left as they are, since the effects change lengths by percents; but what refraction
-        divides a depth by, its index, multiplies the scatter of internal markers when it is taken out.
+        The covariances are left as they are, since the effects change lengths by percents; but refraction divides the
+        depths of internal markers, whose scatter is multiplied again when it is taken out.
         """
         if not self._effects or len(frame.ids) == 0:
             return frame
@@ -140,12 +141,12 @@ class MeasuringCorrection:
         known = np.isin(frame.ids, self._view.ids)
         if self.needs_surface and self.surfaces.at(frame.stamp_ns) is None:
             known &= ~np.isin(frame.ids, self._view.ids[self._view.kinds == "internal"])
-        points = correct_all(frame.points[known], frame.stamp_ns, self._effects, self._view.for_ids(frame.ids[known]))
-        covariances = frame.covariances[known].copy()
+        view, reported = self._view.for_ids(frame.ids[known]), frame.points[known]
+        covariances = frame.covariances[known]
+        points = correct_all(reported, frame.stamp_ns, self._effects, view)
         for effect in self._effects:
             if effect.name == "refraction":
-                internal = self._view.for_ids(frame.ids[known]).kinds == "internal"
-                covariances[internal] *= float(effect.values["index"]) ** 2
+                covariances = spread(reported, covariances, frame.stamp_ns, effect.values, view)
         return replace(
             frame,
             ids=frame.ids[known],

@@ -22,7 +22,7 @@ from livedeform.stereo_node.camera.calibration_uncertainty import (
 from livedeform.stereo_node.camera.known_field import known_field
 from livedeform.stereo_node.camera.rig import StereoRig
 from livedeform.stereo_node.camera.setup import declared_camera_pose, rig_of
-from livedeform.stereo_node.camera.triangulate import Triangulated
+from livedeform.stereo_node.camera.triangulate import Triangulated, triangulate_missing
 from livedeform.stereo_node.detect.adapt import adapted, strongest
 from livedeform.stereo_node.detect.blobs import Blobs
 from livedeform.stereo_node.detect.fiducials import codes_alike, counted_as_left, detect_markers
@@ -292,11 +292,22 @@ class StereoTracker:
     def _middles(
         self, identities: IdentityTracker, spots: Spots, pairs: Pairs, rows: Rows, markers: Rows
     ) -> Triangulated:
-        """Return the middles of the markers of the pairs ``rows``; of discs they are not those of their outlines."""
+        """Return the middles of the markers of the pairs ``rows``; refracted rays to those inside miss each other."""
         left, right = spots.left.take(pairs.left[rows]), spots.right.take(pairs.right[rows])
-        points = pairs.points.take(rows)
+        points = self._of_outlines(identities, left, right, pairs.points.take(rows), markers)
+        inside = self._rest.kinds[markers] == "internal"
+        if not inside.any():
+            return points
+        left, right = left.take(inside), right.take(inside)
+        missing = triangulate_missing(self.rig, left.centres, right.centres, left.covariances, right.covariances)
+        return points.put(inside, missing)
+
+    def _of_outlines(
+        self, identities: IdentityTracker, left: Blobs, right: Blobs, points: Triangulated, markers: Rows
+    ) -> Triangulated:
+        """Return the middles of the ``markers``, whose outlines' are ``points``: of discs they are others."""
         marker = self.settings.detector.marker
-        if marker == "ball" or spots.left.codes is not None or not len(rows):
+        if marker == "ball" or left.codes is not None or not len(markers):
             return points
         if self._discs is None:
             self._discs = DiscCorrection(self.rig, identities.rest, self._rest.kinds, marker == "painted")

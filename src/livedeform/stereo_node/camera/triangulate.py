@@ -1,19 +1,20 @@
-"""The maximum-likelihood point of two pictures, the covariance of such a triangulated point, and its chi-square."""
+"""The point of two pictures, of rays that meet or miss each other, with its covariance and chi-square."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
 
 from livedeform.common.compiled import njit
+from livedeform.common.frames import inverse
 from livedeform.common.types import Array
 from livedeform.stereo_node.camera.lens import lens_of, to_pixel, to_ray
 from livedeform.stereo_node.camera.rig import StereoRig
 
-__all__ = ["Triangulated", "triangulate"]
+__all__ = ["Triangulated", "triangulate", "triangulate_missing"]
 
 
 @dataclass(frozen=True)
@@ -31,6 +32,13 @@ class Triangulated:
         return Triangulated(
             self.points[rows], self.covariances[rows], self.chi2[rows], self.reprojection_error_px[rows]
         )
+
+    def put(self, rows: Any, others: Triangulated) -> Triangulated:
+        """Return the points with ``others`` in these rows."""
+        mixed = {field.name: getattr(self, field.name).copy() for field in fields(self)}
+        for name, values in mixed.items():
+            values[rows] = getattr(others, name)
+        return Triangulated(**mixed)
 
 
 def triangulate(
@@ -64,6 +72,83 @@ def triangulate(
     )
 
 
+def triangulate_missing(
+    rig: StereoRig, left_px: Array, right_px: Array, left_cov: Array, right_cov: Array
+) -> Triangulated:
+    """Find the points whose rays miss each other by more than noise, as refracted ones do.
+
+    `triangulate` shares a miss out as if it were noise: by how sure each picture is, and along its covariance's long
+    axis, which makes it a depth. The correction of refraction is of the point halfway between the rays. So that one is
+    taken, and moved by as much of the miss as noise explains beside what all of them miss by (the best linear
+    estimate); that is in the covariances. Where noise explains all of it this is `triangulate`, whose chi-square it is.
+    """
+    points = _halfways(
+        lens_of(rig.left),
+        lens_of(rig.right),
+        rig.T_right_left,
+        np.ascontiguousarray(left_px, float),
+        np.ascontiguousarray(right_px, float),
+    )
+    left, right, J_left, J_right = rig.project(points)
+    moves = _moves(rig, points, J_left, J_right)
+    S = np.zeros((len(points), 4, 4))
+    S[:, :2, :2], S[:, 2:, 2:] = left_cov, right_cov
+    off = np.concatenate([left_px - left, right_px - right], axis=1)
+    apart = _unit_null(np.concatenate([J_left, J_right], axis=1))
+    miss, by_noise = (apart * off).sum(axis=1), np.einsum("ni,nij,nj->n", apart, S, apart)
+    variance = by_noise + _common(miss, by_noise)
+    together = np.einsum("nai,nij,nj->na", moves, S, apart)
+    shift = -together * (miss / variance)[:, None]
+    left, right, _, _ = rig.project(points + shift)
+    square = ((left - left_px) ** 2).sum(axis=1) + ((right - right_px) ** 2).sum(axis=1)
+    covariances = moves @ S @ np.swapaxes(moves, 1, 2) - _outer(together, together) / variance[:, None, None]
+    return Triangulated(points + shift, covariances, miss**2 / by_noise, np.sqrt(square / 2))
+
+
+def _moves(rig: StereoRig, points: Array, J_left: Array, J_right: Array) -> Array:
+    """Return (n, 3, 4) m/px: how the point halfway between two rays moves with both pixels.
+
+    Each ray moves across itself, J^T (J J^T)^-1; the point is where the squared distances from both are least.
+    """
+    across, out = np.zeros((len(points), 3, 3)), np.empty((len(points), 3, 4))
+    for k, (eye, J) in enumerate(((np.zeros(3), J_left), (inverse(rig.T_right_left)[:3, 3], J_right))):
+        u = (points - eye) / np.linalg.norm(points - eye, axis=1)[:, None]
+        across += np.eye(3) - _outer(u, u)
+        J_T = np.swapaxes(J, 1, 2)
+        out[:, :, 2 * k : 2 * k + 2] = J_T @ np.linalg.inv(J @ J_T)
+    return np.linalg.inv(across) @ out
+
+
+def _common(miss: Array, by_noise: Array) -> Array:
+    """Return (n,) px2: the variance of what the rays ``miss`` (n,) each other by beyond ``by_noise`` (n,), of all of
+    them that meet before both cameras, the sharpest counting most, or the own one where that is more."""
+    beyond = miss**2 - by_noise
+    known = np.isfinite(beyond)
+    weight = (by_noise[known].min(initial=np.inf) / by_noise[known]) ** 2
+    common = float((weight * beyond[known]).sum() / weight.sum()) if known.any() else 0.0
+    return np.asarray(np.maximum(beyond, max(common, 0.0)))
+
+
+def _unit_null(J: Array) -> Array:
+    """Return the unit vectors (n, 4) of pixels in which no point moves, of the derivatives ``J`` (n, 4, 3)."""
+    out = np.stack([(-1) ** k * np.linalg.det(np.delete(J, k, axis=1)) for k in range(4)], axis=1)
+    return np.asarray(out / np.linalg.norm(out, axis=1)[:, None])
+
+
+def _outer(a: Array, b: Array) -> Array:
+    """Return the products (n, i, j) of vectors (n, i) and (n, j)."""
+    return np.asarray(a[:, :, None] * b[:, None])
+
+
+@njit(cache=True, error_model="numpy")
+def _halfways(left, right, T, left_px, right_px):
+    """Apply ``_halfway`` to pixels (n, 2) of both pictures: points (n, 3)."""
+    X = np.empty((len(left_px), 3))
+    for i in range(len(left_px)):
+        X[i, 0], X[i, 1], X[i, 2] = _halfway(left, right, T, left_px[i], right_px[i])
+    return X
+
+
 @njit(cache=True, error_model="numpy")
 def _optimal(left, right, T, left_px, right_px, left_weight, right_weight, n_iterations):
     """Return points (n, 3), covariances (n, 3, 3), chi-square (n,) and rms (n,) px, from pixels (n, 2) and the inverses
@@ -95,7 +180,7 @@ def _optimal(left, right, T, left_px, right_px, left_weight, right_weight, n_ite
 
 @njit(cache=True, error_model="numpy")
 def _halfway(left, right, T, left_px, right_px):
-    """Return the point x, y, z halfway between the two rays' closest points: the start of the optimal solution.
+    """Return the point x, y, z halfway between the two rays' closest points.
 
     NaN where they do not meet in front of both cameras.
     """

@@ -87,6 +87,24 @@ def distort(points: Array, stamp_ns: int, values: Mapping[str, Array], view: Vie
     return out
 
 
+def spread(points: Array, covariances: Array, stamp_ns: int, values: Mapping[str, Array], view: View) -> Array:
+    """Return the covariances (n, 3, 3) m2 of the true points of reported ``points`` (n, 3) m with ``covariances``.
+
+    Depths are stretched and sides hardly: one standard deviation either way along each axis is corrected.
+    """
+    index, rows = float(values["index"]), np.flatnonzero(view.kinds == "internal")
+    out = covariances.copy()
+    if index != 1.0 and len(rows):
+        surface, centres = _surface(stamp_ns, view), _centres(view)
+        size, axes = np.linalg.eigh(covariances[rows])
+        steps = np.moveaxis(axes * np.sqrt(np.maximum(size, 0.0))[:, None], 2, 0)  # (3, k, 3)
+        there = np.stack([_straightened(points[rows] + step, index, centres, surface) for step in steps], axis=2)
+        back = np.stack([_straightened(points[rows] - step, index, centres, surface) for step in steps], axis=2)
+        columns = (there - back) / 2
+        out[rows] = columns @ np.swapaxes(columns, 1, 2)
+    return out
+
+
 def correct(points: Array, stamp_ns: int, values: Mapping[str, Array], view: View) -> Array:
     """Correct reported points to true ones."""
     index, rows = float(values["index"]), np.flatnonzero(view.kinds == "internal")
