@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 
@@ -35,13 +36,16 @@ def press(depth: float = 0.01, n: int = N, noise: float = 5e-5) -> list[MarkerFr
     ]  # fmt: skip
 
 
+def residuals_of(frames: list[MarkerFrame], rows: Iterable[int] | None = None, error: float = 1e-4) -> list[Residual]:
+    """The frames in ``rows`` (all of them) as they are compared with a model that is off by ``error`` m along x."""
+    kept = frames if rows is None else [frames[k] for k in rows]
+    return [Residual(f.stamp_ns, f.ids, f.points, f.points - [error, 0, 0], f.covariances) for f in kept]
+
+
 def metrics(compared: list[int], error: float = 1e-3, threshold: float = 0.005, n_measured: int = N) -> RunMetrics:
     frames = press()
-    residuals = [
-        Residual(f.stamp_ns, f.ids, f.points, f.points - [error, 0, 0], f.covariances)
-        for f in (frames[k] for k in compared)
-    ]
-    coverage = cover(frames, [r.stamp_ns for r in residuals], n_measured=n_measured, noise=5e-5)
+    residuals = residuals_of(frames, compared, error)
+    coverage = cover(frames, residuals, n_measured=n_measured, noise=5e-5)
     return replace(run_metrics(residuals, threshold), coverage=coverage)
 
 
@@ -62,6 +66,19 @@ def test_coverage_bounds_the_verdict(compared: list[int], level: str):
     assert judge(metrics(compared)).level == level
 
 
+@pytest.mark.parametrize("heard", [EVERY, EVERY[::2], EVERY[:30], EVERY[95:], []])
+@pytest.mark.parametrize("compared", [EVERY, EVERY[1::2], EVERY[20:]])
+def test_what_was_compared_counts_whether_or_not_the_recorder_heard_it(heard: list[int], compared: list[int]):
+    """Of 328 frames with an error 83 counted as compared: the recorder's full queue had dropped the others."""
+    frames = press()
+    residuals = residuals_of(frames, compared)
+    coverage = cover([frames[k] for k in heard], residuals, n_measured=N, noise=5e-5)
+    known = sorted({*heard, *compared})
+    at_once = cover([frames[k] for k in known], residuals, n_measured=N, noise=5e-5)
+    assert coverage.frames_compared == run_metrics(residuals, 0.005).n_frames == len(compared)
+    assert coverage == at_once
+
+
 @pytest.mark.parametrize(("hidden", "level"), [(range(0), "OK"), (range(15, 35), "WARN"), (range(15, 85), "STALE")])
 def test_frames_that_hardly_show_the_body_do_not_count(hidden: range, level: str):
     """Three of four markers are hidden, as by the probe's holder: one marker says nothing of the others."""
@@ -69,8 +86,8 @@ def test_frames_that_hardly_show_the_body_do_not_count(hidden: range, level: str
     for k in hidden:
         f = frames[k]
         frames[k] = MarkerFrame(f.stamp_ns, f.ids[3:], f.points[3:], f.covariances[3:], np.zeros(1))
-    residuals = [Residual(f.stamp_ns, f.ids, f.points, f.points - [1e-3, 0, 0], f.covariances) for f in frames]
-    coverage = cover(frames, [f.stamp_ns for f in frames], n_measured=N, noise=5e-5)
+    residuals = residuals_of(frames, error=1e-3)
+    coverage = cover(frames, residuals, n_measured=N, noise=5e-5)
     judged = judge(replace(run_metrics(residuals, 0.005), coverage=coverage))
     assert judged.level == level and coverage.frames_compared == N - len(hidden)
     assert not len(hidden) or f"{len(hidden)}: fewer than half of the markers were seen" in judged.sentence
@@ -114,12 +131,12 @@ def test_both_presses_are_counted():
 def test_noise_makes_and_hides_no_presses(noise: float, stated: bool):
     frames = press(noise=noise)
     floor = np.sqrt(3.0) * noise if stated else float("nan")
-    assert cover(frames, [f.stamp_ns for f in frames], n_measured=N, noise=floor).presses == 2
+    assert cover(frames, residuals_of(frames), n_measured=N, noise=floor).presses == 2
 
 
 def test_noise_alone_is_no_press():
     frames = press(depth=0.0, n=1000, noise=1e-3)
-    coverage = cover(frames, [f.stamp_ns for f in frames], n_measured=len(frames), noise=np.sqrt(3.0) * 1e-3)
+    coverage = cover(frames, residuals_of(frames), n_measured=len(frames), noise=np.sqrt(3.0) * 1e-3)
     assert (coverage.presses, coverage.deepest) == (0, 0)
 
 
@@ -158,7 +175,7 @@ def test_doubts_and_wrong_inputs_are_in_the_sentence():
 
 def test_a_body_at_rest_has_no_presses():
     frames = press(depth=0.0)
-    coverage = cover(frames, [f.stamp_ns for f in frames], n_measured=N, noise=5e-5 * 3**0.5)
+    coverage = cover(frames, residuals_of(frames), n_measured=N, noise=5e-5 * 3**0.5)
     assert coverage.presses == coverage.deepest == 0
 
 
@@ -187,11 +204,11 @@ def test_the_only_press_counts_however_short_it_is(n: int, pressed: int, depth: 
     frames, others = one_press(n, pressed, depth, at)
     floor = np.sqrt(3.0) * 1e-4 if stated else float("nan")
     missed, whole = (
-        cover(frames, [k * STEP for k in compared], n_measured=n, noise=floor) for compared in (others, range(n))
+        cover(frames, residuals_of(frames, compared), n_measured=n, noise=floor) for compared in (others, range(n))
     )
     assert (missed.presses, missed.presses_compared, whole.presses_compared) == (1, 0, 1)
     assert 1 <= missed.deepest <= max(pressed, 0.1 * n) and missed.deepest_compared == 0
-    residuals = [Residual(f.stamp_ns, f.ids, f.points, f.points - [1e-4, 0, 0], f.covariances) for f in frames]
+    residuals = residuals_of(frames)
     judged = judge(replace(run_metrics([residuals[k] for k in others], 0.005), coverage=missed))
     assert judged.level == "STALE" and f"0 of the {missed.deepest} deepest moments" in judged.sentence
     assert judge(replace(run_metrics(residuals, 0.005), coverage=whole)).level == "OK"
@@ -201,10 +218,10 @@ def test_the_only_press_counts_however_short_it_is(n: int, pressed: int, depth: 
 @pytest.mark.parametrize("depth", [0.0, 0.01])
 def test_a_wild_frame_makes_and_hides_no_press(wild: tuple[int, ...], depth: float):
     frames, others = one_press(400, 40, depth)
-    told = [cover(frames, [k * STEP for k in others], n_measured=400, noise=np.sqrt(3.0) * 1e-4)]
+    told = [cover(frames, residuals_of(frames, others), n_measured=400, noise=np.sqrt(3.0) * 1e-4)]
     for k in wild:
         frames[k] = replace(frames[k], points=frames[k].points + np.array([0.0, 0.3, 0.1]))
-    told.append(cover(frames, [k * STEP for k in others], n_measured=400, noise=np.sqrt(3.0) * 1e-4))
+    told.append(cover(frames, residuals_of(frames, others), n_measured=400, noise=np.sqrt(3.0) * 1e-4))
     counts = [(c.presses, c.presses_compared, c.deepest, c.deepest_compared) for c in told]
     assert counts[0] == counts[1] and counts[0][0] == (depth > 0.0)
 
@@ -212,7 +229,8 @@ def test_a_wild_frame_makes_and_hides_no_press(wild: tuple[int, ...], depth: flo
 def test_where_frames_are_far_apart_each_may_be_a_press():
     frames, _ = one_press(12, 1, 0.01)
     frames[9] = replace(frames[6], stamp_ns=frames[9].stamp_ns)
-    coverage = cover(frames, [k * STEP for k in range(12) if k not in (6, 9)], n_measured=12, noise=np.sqrt(3.0) * 1e-4)
+    rest = [k for k in range(12) if k not in (6, 9)]
+    coverage = cover(frames, residuals_of(frames, rest), n_measured=12, noise=np.sqrt(3.0) * 1e-4)
     assert (coverage.presses, coverage.deepest, coverage.deepest_compared) == (1, 1, 0)
 
 
@@ -238,10 +256,10 @@ def test_a_press_counts_however_little_it_is_beside_another(depths: tuple[float,
     frames, floor = pressed_by(depths, left), np.sqrt(3.0) * 2e-5 if stated else float("nan")
     n, least = len(frames), int(np.argmin(depths))
     others = [k for k in range(n) if not 60 + 60 * least <= k < 80 + 60 * least]
-    whole, missed = (cover(frames, [k * STEP for k in c], n_measured=n, noise=floor) for c in (range(n), others))
+    whole, missed = (cover(frames, residuals_of(frames, c), n_measured=n, noise=floor) for c in (range(n), others))
     assert (whole.presses, whole.presses_compared) == (len(depths), len(depths))
     assert (missed.presses, missed.presses_compared) == (len(depths), len(depths) - 1)
-    residuals = [Residual(f.stamp_ns, f.ids, f.points, f.points - [1e-4, 0, 0], f.covariances) for f in frames]
+    residuals = residuals_of(frames)
     judged = judge(replace(run_metrics([residuals[k] for k in others], 0.005), coverage=missed))
     assert judged.level == "WARN" and f"only {len(depths) - 1} of {len(depths)} presses" in judged.sentence
     recording = Recording(Path("x"), 0, n * STEP, frames, [], [], {}, {})
@@ -256,7 +274,7 @@ def test_a_mislabelled_frame_does_not_decide_where_markers_rest(wild: tuple[int,
         frames[k].points[3] += [0.0, 0.03, 0.0]
     others = np.setdiff1d(np.arange(len(frames)), wild)
     np.testing.assert_allclose(motion(frames)[others], motion(clean)[others], atol=1e-6)  # m; measured 1.4e-7
-    told = cover(frames, [f.stamp_ns for f in frames], n_measured=len(frames), noise=np.sqrt(3.0) * 2e-5)
+    told = cover(frames, residuals_of(frames), n_measured=len(frames), noise=np.sqrt(3.0) * 2e-5)
     assert told.presses == 4
     track, sound = (MarkerTrack(Recording(Path("x"), 0, 1, f, [], [], {}, {})) for f in (frames, clean))
     assert np.abs(track.rest - sound.rest).max() < 1e-5  # m; measured 1.2e-6
@@ -284,5 +302,5 @@ def test_noise_that_is_larger_than_stated_and_drift_make_no_presses(
     for frames in (pressed_by(depths, noise=noise), pressed_by(depths, noise=noise)[::-1]):
         for k, frame in enumerate(frames):
             frame.points[:, 1] += drift * k / len(frames)
-        told = cover(frames, [f.stamp_ns for f in frames], n_measured=len(frames), noise=np.sqrt(3.0) * 2e-5)
+        told = cover(frames, residuals_of(frames), n_measured=len(frames), noise=np.sqrt(3.0) * 2e-5)
         assert told.presses == len(depths)

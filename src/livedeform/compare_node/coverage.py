@@ -7,9 +7,11 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from livedeform.common.checks.presses import count_presses, lasting, motion, shows_the_body, without_noise
 from livedeform.common.types import Array, MarkerFrame
+from livedeform.compare_node.residual import Residual
 
 DEEPEST_SHARE = 0.1  # of the frames, at most, those with the largest motion, are the deepest moments
 PRESSED = 0.5  # of the largest motion, of all or of a press: so deep are the moments that count
@@ -58,8 +60,8 @@ def read_coverage(document: Mapping[str, Any] | None) -> Coverage | None:
 
 
 def cover(
-    frames: Sequence[MarkerFrame],
-    compared_ns: Sequence[int],
+    heard: Sequence[MarkerFrame],
+    residuals: Sequence[Residual],
     *,
     n_measured: int,
     noise: float,
@@ -70,15 +72,15 @@ def cover(
     interrupted: bool = False,
     reasons: Mapping[str, int] | None = None,
 ) -> Coverage:
-    """The coverage of measured ``frames`` of which those at the stamps ``compared_ns`` were compared.
+    """The coverage of the measured frames: those that the recorder ``heard``, and those of ``residuals``, which were
+    compared, whether it heard them or not.
 
     ``n_measured``: frames that were to be measured, each stamp once, which are more where pictures gave no frame.
     ``noise`` (m): rms of the measuring noise, NaN where it is not known. ``traffic``: messages of each listener.
     """
+    frames = _measured(heard, residuals)
     moved = motion(frames)
-    answered = np.isin([frame.stamp_ns for frame in frames], list(compared_ns))
-    few = ~shows_the_body(np.array([np.isfinite(f.points).all(axis=1).sum() for f in frames]))
-    compared = answered & ~few
+    compared, n_few = _compared(frames, residuals)
     deepest, presses = _pressed(moved, noise)
     rms, largest = _sizes(moved[np.isfinite(moved)])
     return Coverage(
@@ -90,13 +92,31 @@ def cover(
         deepest_compared=int((deepest & compared).sum()),
         skipped=skipped,
         repeated=repeated,
-        refused={reason: n for reason, n in (*(refused or {}).items(), (FEW, int((answered & few).sum()))) if n},
+        refused={reason: n for reason, n in (*(refused or {}).items(), (FEW, n_few)) if n},
         **_balance(list(traffic)),
         interrupted=interrupted,
         motion_rms=rms,
         motion_largest=largest,
         reasons=dict(reasons or {}),
     )
+
+
+def _measured(heard: Sequence[MarkerFrame], residuals: Sequence[Residual]) -> Sequence[MarkerFrame]:
+    """Return the frames that were ``heard``, by their stamps, and of those that were not what the residuals tell."""
+    known = {frame.stamp_ns for frame in heard}
+    unheard = [
+        MarkerFrame(r.stamp_ns, r.ids, r.measured, r.covariances, np.full(len(r.ids), np.nan))
+        for r in residuals
+        if len(r.ids) and r.stamp_ns not in known
+    ]
+    return sorted([*heard, *unheard], key=lambda frame: frame.stamp_ns) if unheard else heard
+
+
+def _compared(frames: Sequence[MarkerFrame], residuals: Sequence[Residual]) -> tuple[NDArray[np.bool_], int]:
+    """Return which frames (n,) were compared, and how many others would have been, had they shown the body."""
+    answered = np.isin([frame.stamp_ns for frame in frames], [r.stamp_ns for r in residuals if len(r.ids)])
+    few = ~shows_the_body(np.array([np.isfinite(f.points).all(axis=1).sum() for f in frames]))
+    return answered & ~few, int((answered & few).sum())
 
 
 def _sizes(moved: Array) -> tuple[float, float]:

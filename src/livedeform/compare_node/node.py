@@ -15,7 +15,7 @@ from livedeform.common.experiment.yaml_file import load_experiment
 from livedeform.common.node_parameters import within
 from livedeform.common.ros import messages as m
 from livedeform.common.ros.node import CountingNode, run
-from livedeform.common.ros.session import RELIABLE, SENSOR, declare
+from livedeform.common.ros.session import SENSOR, declare
 from livedeform.compare_node.associate import Associator
 from livedeform.compare_node.judgement import doubts_so_far, level_of
 from livedeform.compare_node.metrics import Level, RunningTotal, frame_metrics
@@ -53,7 +53,7 @@ class CompareNode(CountingNode):
             )
         }  # fmt: skip
         self._last_stamp_ns, self._fresh, self._total = 0, False, RunningTotal(self.threshold)
-        quality = SENSOR if settings.best_effort else RELIABLE
+        quality = SENSOR if settings.best_effort else None
         self.subscribe(PointCloud2, t.STEREO_MARKERS, self.on_measured, quality, gate=True)
         self.subscribe(PointCloud2, t.FEM_MARKERS, self.on_predicted, gate=True)
         if settings.stale_after > 0:

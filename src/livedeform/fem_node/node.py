@@ -15,7 +15,7 @@ from livedeform.common import topics as t
 from livedeform.common.experiment.yaml_file import load_experiment
 from livedeform.common.ros import messages as m
 from livedeform.common.ros.node import CountingNode, run
-from livedeform.common.ros.session import RELIABLE, SENSOR, declare
+from livedeform.common.ros.session import SENSOR, declare
 from livedeform.common.types import Prediction, Wrench
 from livedeform.fem_node.live.predictor import full_model, make_predictor, make_worker
 from livedeform.fem_node.live.triggers import Moment, make_requests
@@ -43,7 +43,7 @@ class FemNode(CountingNode):
         self._wrench = self.publisher(WrenchStamped, t.FEM_WRENCH)
         self._wake = self.create_guard_condition(self.publish_finished)
         self.worker = make_worker(predictor, settings.newest_only, self._wake.trigger)
-        quality, probe = SENSOR if settings.best_effort else RELIABLE, self.model.physics.probe
+        quality, probe = SENSOR if settings.best_effort else None, self.model.physics.probe
         self._is_live = settings.newest_only
         self._requests = make_requests(settings.trigger, probe is not None, probe.time_offset if probe else 0.0)
         self.subscribe(PoseStamped, t.PROBE_POSE, self.on_pose, quality, gate=True)

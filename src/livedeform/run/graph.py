@@ -2,7 +2,8 @@
 
 Lock step: a message is published, the executor spins until every node has handled it and everything that it gave rise
 to, then comes the next. Nothing is lost, and two runs give the same numbers. Real time: messages are published when
-they are due.
+they are due, or late, but never before those that were published are heard: nothing is lost there either, and what a
+model is too slow for is told by its own counts.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ from livedeform.common import topics as t
 from livedeform.common.bags.types import RawMessage
 from livedeform.common.errors import LivedeformError
 from livedeform.common.ros.node import CountingNode
-from livedeform.common.ros.session import LONG_SENSOR, RELIABLE, SENSOR, StopFlag, ros
+from livedeform.common.ros.session import LONG_SENSOR, QUEUE_DEPTH, RELIABLE, SENSOR, StopFlag, ros
 from livedeform.run.recorder import RunRecorder
 
 MATCH_SECONDS = 30.0
@@ -267,25 +268,47 @@ class Graph:
     def drain(self, patience: float) -> None:
         """Handle what has arrived, for no longer than ``patience`` (s); what is left in the queues then is lost."""
         self.join()
-        deadline, idle, handled = time.monotonic() + patience, 0, -1
-        while idle < IDLE_SPINS and time.monotonic() < deadline:
+        deadline = time.monotonic() + patience
+        self._handle_while(lambda: time.monotonic() < deadline)
+        for node in self.nodes:
+            node.pass_over()
+
+    def catch_up(self, topics: Iterable[str]) -> None:
+        """Handle what was published on ``topics``, until a stop is asked for, and elsewhere so much that no queue is
+        half full: what is published on top of a full one pushes its oldest message out. What got lost is not waited
+        for."""
+        wanted = list(topics)
+
+        def behind() -> bool:
+            late = self.outstanding()
+            return any(topic in late for topic in wanted) or 2 * max(late.values(), default=0) > QUEUE_DEPTH
+
+        self._handle_while(lambda: not self.stop and behind())
+
+    def _handle_while(self, wanted: Callable[[], bool]) -> None:
+        """Handle messages while that is ``wanted`` and some are there."""
+        idle, handled = 0, -1
+        while idle < IDLE_SPINS and wanted():
             self.spin_once(0.0)
             now = sum(node.traffic.n_handled for node in self.nodes)
             idle, handled = (idle + 1 if now == handled else 0), now
-        for node in self.nodes:
-            node.pass_over()
 
     def finish(self, patience: float | None = None) -> None:
         """The input has ended: each node in turn publishes what it held back, as the next may wait for it.
 
-        With ``patience`` (s) messages that got lost on the way are given up after that time; they are in ``lost``.
+        With ``patience`` (s) messages that got lost on the way are given up when for so long those that are outstanding
+        did not become fewer; they are in ``lost``.
         """
         for node in self.nodes:
             node.finish()
             if patience is None:
                 self.settle()
-            deadline = math.inf if patience is None else time.monotonic() + patience
-            while (node.busy or self.outstanding()) and time.monotonic() < deadline:
+            deadline = fewest = math.inf
+            while (late := sum(self.outstanding().values())) or node.busy:
+                if late < fewest and patience is not None:
+                    deadline, fewest = time.monotonic() + patience, late
+                if time.monotonic() >= deadline:
+                    break
                 self.spin_once(0.05)
 
     def crowded(self) -> dict[str, int]:
@@ -311,9 +334,11 @@ def play_in_lock_step(graph: Graph, player: Player, messages: Iterable[RawMessag
 def play_in_real_time(
     graph: Graph, player: Player, messages: Iterable[RawMessage], rate: float
 ) -> Iterator[tuple[RawMessage, float]]:
-    """Plays messages when they are due at ``rate`` times the recorded speed; yields each with how late it is (s)."""
+    """Plays messages when they are due at ``rate`` times the recorded speed, and late where those before are not
+    heard yet; yields each with how late it is (s)."""
     begin: tuple[float, int] | None = None
     for raw in messages:
+        graph.catch_up(player.outlets)
         now = time.monotonic()
         begin = begin or (now, raw.log_time_ns)
         due = begin[0] + (raw.log_time_ns - begin[1]) * 1e-9 / rate

@@ -118,7 +118,7 @@ def _coverage(
     }
     return cover(
         recording.marker_frames,
-        [residual.stamp_ns for residual in residuals if len(residual.ids)],
+        residuals,
         n_measured=n_measured,
         repeated=repeats.left_out,
         noise=noise,
