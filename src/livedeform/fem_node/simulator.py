@@ -111,6 +111,10 @@ class Simulator:
             poses, stamps, directions, start_ns=recorded.start_ns, walk_settings=walk_settings, warm=warm
         )
 
+    def unload(self, physics: Physics, directions: Sequence[Direction]) -> None:
+        """Find the unloaded shapes of a body and along directions, which are kept for its next simulations."""
+        self._shapes.along(physics, self._shapes.of(physics), directions)
+
     def rest(self, physics: Physics) -> Array:
         """Return the markers (m, 3) m at rest at the clock's start, under what weight and loads act then, without the
         probe: a body that is let go later is held as it was scanned (`Timeline.moment`)."""

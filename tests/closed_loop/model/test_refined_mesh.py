@@ -151,6 +151,26 @@ def test_a_speck_does_not_buy_a_better_mesh():
     assert np.linalg.norm(told) < 0.1 * np.linalg.norm(declared)
 
 
+@pytest.mark.slow
+def test_an_inclusion_that_moves_by_less_than_an_element_keeps_its_mesh():
+    """Nothing is solved without effects again; what is told is nearly what a mesh of its own tells. One that is
+    elsewhere has a mesh with halved elements at both places."""
+    _, o, model, anew = pressed_block()
+    key = first_key(o)
+
+    def told(by: Anew, x: float) -> Array:
+        ball = [toy.effect("inclusion", centre=[x, 0.0, 0.03], radius=0.01, ratio=6.0)]
+        return by(ball, [o], lambda: model.run(ball, [o])).of_points([o])
+
+    told(anew, 0.01)
+    mesh = anew.halved[key][0].body.setting.mesh
+    near, alone = told(anew, 0.0101), told(replace(anew, halved={}), 0.0101)
+    assert [halved.body.setting.mesh for halved in anew.halved[key]] == [mesh]
+    assert np.linalg.norm(near - alone) < 0.01 * np.linalg.norm(alone)  # measured 2.1e-4
+    told(anew, 0.025)
+    assert len(anew.halved[key]) == 2 and anew.halved[key][1].split[anew.halved[key][0].uneven].all()
+
+
 @pytest.mark.parametrize(
     "name, values", [("viscoelasticity", {"g": [0.2], "tau": [2.0]}), ("stereo_scale", {"scale": 1.01})]
 )

@@ -14,7 +14,7 @@ from livedeform.closed_loop.candidates import Candidate
 from livedeform.closed_loop.evidence.observation import Observation
 from livedeform.closed_loop.forward import Column, Run, dictionary_columns
 from livedeform.closed_loop.model.fem_model import Body, Setting
-from livedeform.closed_loop.model.workers import FemModel, shares
+from livedeform.closed_loop.model.workers import FemModel, shares, simulate_each
 from livedeform.common.types import EffectValues, Pose
 from livedeform.fem_node.contact.probe_shapes import make_shape
 from livedeform.fem_node.mesh.structured import block_mesh
@@ -55,6 +55,19 @@ def test_two_processes_give_what_one_gives(names: tuple[str, ...]) -> None:
     for c in range(one.d_points.shape[-1]):
         difference = np.linalg.norm(two.d_points[..., c] - one.d_points[..., c])
         assert difference <= 2e-2 * np.linalg.norm(one.d_points[..., c])
+
+
+def test_parts_of_a_recording_share_its_unloaded_shapes() -> None:
+    """Those of the body and of its columns are found once, before the parts, and kept: workers know them."""
+    g = np.array([0.0, 0.0, -9.81])
+    body, o = Body(phantom.setting(2, scan_fraction=1.0, scan_gravity=g, gravity=g)), phantom.moments(SECONDS)
+    stiffness = toy.candidates(toy.markers(), ["stiffness"])["stiffness"]
+    columns = dictionary_columns([stiffness])
+    whole = body.simulate([], o, columns)
+    again = Body(body.setting)
+    parts = simulate_each([again], [], [o], columns, processes=2)[0]
+    assert len(again._simulator._shapes._followed[1]) == 1
+    np.testing.assert_allclose(parts.points, whole.points, atol=2e-7)
 
 
 def test_columns_of_a_body_in_motion_are_shared_out_if_it_is_alone() -> None:

@@ -87,8 +87,7 @@ class Body:
         found any more."""
         began = time.perf_counter()
         physics = self.physics(effects, o.name)
-        mechanical = [c for c in columns if c.candidate.name in MECHANICAL]
-        directions = [self._direction(effects, physics, column, o.name) for column in mechanical]
+        directions = self._directions(effects, physics, columns, o.name)
         whole = _remembered(o, memory_of(physics))
         recorded = _recorded(whole)
         walk_settings = self.walk_settings if path_steps else replace(self.walk_settings, path_step=None)
@@ -108,6 +107,12 @@ class Body:
             d_forces[..., acting] = simulated.d_forces[last] - d_late
         reasons = tuple({p.message: None for p in simulated.predictions[last] if not p.converged})
         return Run(points, forces, d_points, d_forces, time.perf_counter() - began, reasons)
+
+    def unload(self, effects: Sequence[EffectValues], recording: str, columns: Sequence[Column]) -> None:
+        """Find the unloaded shapes that a recording with ``effects`` and its columns needs: they take longer than some
+        moments, and are kept."""
+        physics = self.physics(effects, recording)
+        self._simulator.unload(physics, self._directions(effects, physics, columns, recording))
 
     def astray(self, o: Observation, moment: int) -> str:
         """Say how far a ``moment`` of the declared model is from where the graph comes to that follows the recorded
@@ -146,6 +151,13 @@ class Body:
         it."""
         physics = apply_effects(self.setting.declared_in(recording), with_others(self.setting.declared, effects))
         return replace(physics, clock_start_ns=self.setting.clock_start_ns)
+
+    def _directions(
+        self, effects: Sequence[EffectValues], physics: Physics, columns: Sequence[Column], recording: str
+    ) -> list[Direction]:
+        """Return the directions of the columns that act on the body."""
+        mechanical = [c for c in columns if c.candidate.name in MECHANICAL]
+        return [self._direction(effects, physics, column, recording) for column in mechanical]
 
     def _direction(
         self, effects: Sequence[EffectValues], physics: Physics, column: Column, recording: str

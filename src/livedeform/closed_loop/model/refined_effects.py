@@ -24,6 +24,7 @@ from livedeform.closed_loop.settings import DiscretisationSettings
 from livedeform.common.types import Array, EffectValues
 from livedeform.fem_node.effects import EFFECTS as MECHANICAL
 from livedeform.fem_node.effects import makes_rub
+from livedeform.fem_node.mesh.tet_mesh import TetMesh
 from livedeform.fem_node.physics.memory import memory_of, pulls
 from livedeform.fem_node.physics.record import Physics
 from livedeform.fem_node.refinement import jumps, refined
@@ -37,6 +38,17 @@ class Known:
 
     second: Body
     declared: Run
+
+
+@dataclass(frozen=True)
+class Halved:
+    """A ``body`` whose ``uneven`` elements (n,) of a second one are halved, which are ``split`` (n,) with some beside
+    them for faces to fit, and what that ``alone`` improves."""
+
+    uneven: NDArray[np.bool_]
+    split: NDArray[np.bool_]
+    body: Body
+    alone: Correction
 
 
 @dataclass(frozen=True)
@@ -55,7 +67,7 @@ class Anew:
     settings: DiscretisationSettings
     slips: bool = False
     processes: int = 2
-    halved: dict[tuple[Key, bytes], tuple[Body, Correction]] = field(default_factory=dict)
+    halved: dict[Key, list[Halved]] = field(default_factory=dict)
     drags: dict[tuple[Key, Kind], ElementDrag] = field(default_factory=dict)
 
     def __call__(
@@ -123,27 +135,36 @@ class Anew:
         observations: Sequence[Observation],
         runs: Sequence[Run],
         columns: Sequence[Column],
-        uneven: Sequence[np.ndarray],
+        uneven: Sequence[NDArray[np.bool_]],
     ) -> Correction:
         """Return the correction by meshes with their ``uneven`` elements (n,) halved."""
         bodies, alone = [], Correction()
         for o, there in zip(observations, uneven, strict=True):
-            body, more = self._halved(o, there) if there.any() else (self._known(o).second, Correction())
-            bodies.append(body)
-            alone = alone.updated(more)
+            halved = self._halved(o, there) if there.any() else None
+            bodies.append(self._known(o).second if halved is None else halved.body)
+            alone = alone if halved is None else alone.updated(halved.alone)
         told = simulate_each(bodies, effects, observations, columns, self.processes)
         return difference(observations, runs, told, columns).less(alone)
 
-    def _halved(self, o: Observation, uneven: np.ndarray) -> tuple[Body, Correction]:
-        """Return the body with its ``uneven`` elements (n,) halved, and what that alone improves."""
-        key, known = (first_key(o), uneven.tobytes()), self._known(o)
-        if key not in self.halved:
-            setting = known.second.setting
-            body = Body(replace(setting, mesh=refined(setting.mesh, np.flatnonzero(uneven))))
-            body.start_from(known.second)
-            told = simulate_each([body], [], [o], (), self.processes)
-            self.halved[key] = body, difference([o], [known.declared], told)
-        return self.halved[key]
+    def _halved(self, o: Observation, uneven: NDArray[np.bool_]) -> Halved:
+        """Return the body with its ``uneven`` elements (n,) halved, or one that has more of them halved: it is as
+        exact, and starts from what it solved of the effects as they were a step of the fit before."""
+        before = self.halved.setdefault(first_key(o), [])
+        fit = [halved for halved in before if halved.split[uneven].all()]
+        if fit:
+            return min(fit, key=lambda halved: int(halved.split.sum()))
+        both = uneven | before[-1].uneven if before else uneven
+        before.append(self._made(o, both if both.mean() < self.settings.most_uneven else uneven))
+        return before[-1]
+
+    def _made(self, o: Observation, uneven: NDArray[np.bool_]) -> Halved:
+        """Make the body with its ``uneven`` elements (n,) halved, and find what that alone improves."""
+        known = self._known(o)
+        mesh = refined(known.second.setting.mesh, np.flatnonzero(uneven))
+        body = Body(replace(known.second.setting, mesh=mesh))
+        body.start_from(known.second)
+        told = simulate_each([body], [], [o], (), self.processes)
+        return Halved(uneven, split(known.second.setting.mesh, mesh), body, difference([o], [known.declared], told))
 
     def _pressed_first(
         self,
@@ -173,6 +194,12 @@ class Anew:
         bodies = [self._known(observations[n]).second for n in asked]
         told = simulate_each(bodies, effects, some, columns, self.processes) if some else []
         return difference(some, [runs[n].take(keep[n]) for n in asked], told, columns)
+
+
+def split(before: TetMesh, after: TetMesh) -> NDArray[np.bool_]:
+    """Return which elements (n,) of the mesh ``before`` are no elements of the one ``after`` it was refined."""
+    whole = {tuple(corners) for corners in np.sort(after.tets, axis=1).tolist()}
+    return np.array([tuple(corners) not in whole for corners in np.sort(before.tets, axis=1).tolist()])
 
 
 def remembers(physics: Physics) -> bool:

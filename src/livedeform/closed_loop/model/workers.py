@@ -414,7 +414,9 @@ def simulate_each(
     processes: int,
 ) -> list[Run]:
     """Let each of the ``bodies`` simulate its recording, which is cut into parts where nothing remembers; the next time
-    it starts from what was found."""
+    it starts from what was found. Unloaded shapes are found here, once for all parts: workers would forget them."""
+    for body, o in zip(bodies, observations, strict=True):
+        body.unload(effects, o.name, columns)
     parts = 1 if memory_of(bodies[0].physics(effects)).path_dependent else processes
     with worker_pool(processes, _BODIES.extend, list(bodies)) as pool:
         asked = [

@@ -119,6 +119,7 @@ class UnloadedShapes:
     def __init__(self, space: Space, settings: SolverSettings | None = None, threads: int | None = None) -> None:
         self._space, self._settings, self._threads = space, settings, threads
         self._known: list[tuple[Physics, Array]] = []
+        self._followed: tuple[Physics | None, list[tuple[Physics, Array | None]]] = (None, [])  # of the last leader
 
     def of(self, physics: Physics) -> Array | None:
         """Return the displacement (n, 3) m from the scanned to the unloaded shape; None if that is the scanned one.
@@ -129,7 +130,9 @@ class UnloadedShapes:
         for known, shape in self._known:
             if same_physics(known, key):
                 return shape
-        shape = unloaded_shape(self._inverse(physics))
+        inverse = self._inverse(physics)
+        near = self._known[-1][1] if self._known and not inverse.slips else None  # friction goes by the way there
+        shape = unloaded_shape(inverse, near)
         self._known = [*self._known[-MOST_KEPT:], (key, shape)]
         return shape
 
@@ -141,14 +144,26 @@ class UnloadedShapes:
         if not wanted:
             return shapes
         w = np.zeros_like(self._space.nodes) if unloaded is None else unloaded
-        inverse, changed = self._inverse(physics), [directions[k].physics for k in wanted]
-        try:
-            found: list[Array | None] = list(changed_shapes(inverse, w, changed))
-        except ConvergenceError:  # of one of them: the others are still wanted
-            found = [_one_shape(inverse, w, one) for one in changed]
-        for k, shape in zip(wanted, found, strict=True):
+        for k, shape in zip(wanted, self._beside(physics, w, [directions[k].physics for k in wanted]), strict=True):
             shapes[k] = unloaded if shape is None else shape
         return shapes
+
+    def _beside(self, physics: Physics, w: Array, changed: Sequence[Physics]) -> list[Array | None]:
+        """Return the shapes with ``changed`` physics beside the shape ``w`` (n, 3) of a body, None where it cannot be
+        followed; those of the last body are kept: its recordings, and parts of these, ask for the same."""
+        leader, keys = as_scanned(physics), [as_scanned(one) for one in changed]
+        if self._followed[0] is None or not same_physics(self._followed[0], leader):
+            self._followed = leader, []
+        known = self._followed[1]
+        new = [i for i, key in enumerate(keys) if not any(same_physics(key, other) for other, _ in known)]
+        if new:
+            inverse, asked = self._inverse(physics), [changed[i] for i in new]
+            try:
+                found: list[Array | None] = list(changed_shapes(inverse, w, asked))
+            except ConvergenceError:  # of one of them: the others are still wanted
+                found = [_one_shape(inverse, w, one) for one in asked]
+            known += zip([keys[i] for i in new], found, strict=True)
+        return [next(shape for other, shape in known if same_physics(key, other)) for key in keys]
 
     def _inverse(self, physics: Physics) -> InverseProblem:
         return InverseProblem(self._space, physics, settings=self._settings, threads=self._threads)
