@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -91,9 +92,10 @@ def test_the_first_step_has_all_of_it():
 
 def test_a_step_of_time_ends_where_a_load_begins_to_pull():
     line = Timeline(0, 0, release=0.2, dynamic=True, delays=(0.0123456,))
-    stamps = [i.stamp_ns for i in line.instants(200_000_000, 230_000_000, lambda: 0.005)]
+    body = Mock(pace=lambda: 0.005)
+    stamps = [i.stamp_ns for i in line.instants(200_000_000, 230_000_000, body)]
     assert 212_345_600 in stamps and stamps[-1] == 230_000_000 and max(np.diff(stamps)) <= 5_000_000
-    at_once = line.instants(200_000_000, 212_346_000, lambda: 0.005)  # as near as that to a stamp none is made
+    at_once = line.instants(200_000_000, 212_346_000, body)  # as near as that to a stamp none is made
     assert min(np.diff([i.stamp_ns for i in at_once])) > 1_000_000
 
 

@@ -44,7 +44,7 @@ SAME_STEP = 0.85, 1.25  # of a step, within which the next one is as long: the f
 FADING = 0.97  # per step, of what is remembered of the last swing: a quarter of a period is ten steps
 DAMPING = 0.05  # 0 to 1/3; what is not resolved at all shrinks to 0.90 per step
 SLIP = 0.55  # the rates of the inner force: 1/2 is the mean of both ends, 1 the later one
-MEMORY = 4.0  # s of motion before a moment that is followed; what was earlier has died out
+MEMORY = 4.0  # s of motion before a moment that are followed at least: more where a swing lasts longer (`swinging`)
 
 
 def moves(inertia: Inertia | None, moment: Moment) -> bool:
@@ -136,7 +136,7 @@ class Inertial(PlainItem):
         rows, columns = np.repeat(nodes, a, axis=1).ravel(), np.tile(nodes, (1, a)).ravel()
         return csr_array((blocks.ravel(), (rows, columns)), shape=(n, n))
 
-    def _times_mass(self, v: Array) -> Array:
+    def times_mass(self, v: Array) -> Array:
         """Return M v (n,)."""
         out: Array = self._matrix @ v.reshape(-1, 3)
         return out.ravel()
@@ -169,7 +169,7 @@ class Inertial(PlainItem):
             return 0.0
         v, a = self._rates(x)
         rate = a + self._inertia.rayleigh_alpha * v
-        force, (slope, share), past = self._times_mass(rate), self._slope(), self._past()
+        force, (slope, share), past = self.times_mass(rate), self._slope(), self._past()
         system.r[: self._n] += share * force + past
         if tangent:
             system.add_blocks(self._positions, share * slope * self._blocks)
@@ -184,12 +184,12 @@ class Inertial(PlainItem):
             return
         v, a = self._rates(x)
         share = self._slope()[1]
-        R = -share * self._times_mass(a + self._inertia.rayleigh_alpha * v) - self._past()
+        R = -share * self.times_mass(a + self._inertia.rayleigh_alpha * v) - self._past()
         self._state = self._state.moved_to(x[: self._n].copy(), v, a, np.asarray(R), self._dt, self._size)
 
     def _size(self, field: Array) -> float:
         """Return the length of a ``field``'s (n,) vectors, the root mean square over the mass."""
-        return float(np.sqrt(max(float(field @ self._times_mass(field)), 0.0) / self._total))
+        return float(np.sqrt(max(float(field @ self.times_mass(field)), 0.0) / self._total))
 
     @property
     def step(self) -> float:

@@ -23,6 +23,9 @@ from livedeform.fem_node.element.simd import LANES, collect, gather, load, n_blo
 from livedeform.fem_node.materials.base import in_blocks, inverse_transpose, product
 from livedeform.fem_node.physics.record import Prony
 
+SHARE_OF_TAU = 0.25  # of the shortest relaxation time, that steps may be long where stress begins to fade
+MOST_LONGER = 2.0  # than the step before, that one may be without being cut: input whose intervals scatter is not
+
 
 @dataclass(frozen=True)
 class Overstress:
@@ -57,6 +60,14 @@ def begin(prony: Prony, state: Overstress, dt: float) -> Step:
     weight = beta * np.where(x > 1e-8, -np.expm1(-x) / np.maximum(x, 1e-300), 1.0 - 0.5 * x)
     H = np.tensordot(decay, state.Q, axes=1) - weight.sum() * state.S
     return Step(1.0 + float(weight.sum()), H, decay, weight)
+
+
+def longest_step(prony: Prony | None, dt: float) -> float:
+    """Return how long (s) the next step may be that is as good as those of a run of the whole, after one of ``dt`` s
+    (0, inf: something has just changed); inf where nothing relaxes."""
+    if prony is None:
+        return np.inf
+    return max(SHARE_OF_TAU * min(prony.tau), MOST_LONGER * dt if np.isfinite(dt) else 0.0)
 
 
 def end(step: Step, state: Overstress, S: Array) -> Overstress:

@@ -19,6 +19,7 @@ from livedeform.common.bags.recording import load_poses
 from livedeform.common.errors import InputError
 from livedeform.common.frames import apply, pose_matrix
 from livedeform.common.types import Array, Pose
+from livedeform.fem_node.items.viscoelastic import SHARE_OF_TAU
 from livedeform.fem_node.model import PhantomModel
 from livedeform.fem_node.path.timeline import LEVER, LONGEST_PATH_STEP
 from livedeform.fem_node.physics.memory import memory_of
@@ -27,7 +28,6 @@ from livedeform.fem_node.physics.record import Physics
 TOLERANCE = 1e-4  # m
 SPACING = 2e-3  # m, along the path: a probe that slides leaves a set all the way
 TIMES_TOLD = 10  # per recording
-SHARE_OF_TAU = 0.25  # of the shortest relaxation time, that key poses may be apart
 
 
 def remembers_for_good(physics: Physics) -> bool:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -16,12 +16,14 @@ from livedeform.common.types import Array
 from livedeform.fem_node.contact.contact import ProbeContact, make_contact
 from livedeform.fem_node.contact.self_contact import FacingParts
 from livedeform.fem_node.element.element import Space
+from livedeform.fem_node.items import viscoelastic
 from livedeform.fem_node.items.continuum import Continuum
 from livedeform.fem_node.items.dynamics import Inertial, moves
 from livedeform.fem_node.items.loads import Dead, Weight, hung_masses
 from livedeform.fem_node.items.protocol import Item, Moment, same_moment
 from livedeform.fem_node.items.rubbing_load import RubbingLoad
 from livedeform.fem_node.items.supports import make_supports
+from livedeform.fem_node.items.swinging import Applied, lowest_rate, seconds_of_swing
 from livedeform.fem_node.items.two_bodies import make_interface
 from livedeform.fem_node.path.start import Extrapolation, Start, pose_distance
 from livedeform.fem_node.physics.memory import memory_of
@@ -275,6 +277,40 @@ class Mechanics:
         """Return how long (s) the next dynamic step may be."""
         return np.inf if self.inertial is None else self.inertial.step
 
+    def pace_at_rest(self) -> float:
+        """Return how long (s) the next step without inertia may be."""
+        return viscoelastic.longest_step(self.physics.prony, self.moment.dt)
+
+    def swings_for(self) -> float:
+        """Return how long (s) a swing lasts beside the committed state: of the slowest mode, relaxed as the body may
+        be. All is as before; inf where the tangent does not tell."""
+        if self.inertial is None:
+            return 0.0
+        saved = self.save()
+        self.prepare(replace(self.moment, dt=np.inf, still=True, held=False))
+        try:
+            with self.factorised_at(self.x, keep=False):
+                return seconds_of_swing(self.physics, self._lowest_rate(self.inertial))
+        except ConvergenceError:
+            return np.inf
+        finally:
+            self.restore(saved)
+
+    def _lowest_rate(self, inertial: Inertial) -> float:
+        """Return the rate (rad/s) of the slowest mode, once the tangent is factorised."""
+        n = 3 * self.space.n_nodes
+        free = np.ones(self.space.n_dof, bool)
+        free[self.held()] = False
+
+        def times_compliance(forces: Array) -> Array:
+            load = np.zeros((len(free), forces.shape[1]), order="F")
+            load[:n] = forces
+            load[~free] = 0.0
+            return self.solver.answering.solve_exactly(load)[:n]
+
+        times_mass: Applied = partial(np.apply_along_axis, inertial.times_mass, 0)
+        return lowest_rate(times_mass, times_compliance, self.space.nodes, free[:n])
+
     def ahead(self, moment: Moment) -> list[Start]:
         """Return where the motion leads by ``moment``, to start a solution from; nothing without motion."""
         if self.inertial is None or not moves(self.physics.inertia, moment):
@@ -346,5 +382,9 @@ class Mechanics:
                 self.solver.drop_factor()
 
     def reset(self) -> None:
-        """Go back to the stress-free shape, without history."""
+        """Go back to the stress-free shape, without history: nor that of the solver, whose kept factor would lead to
+        the same equilibria only within their tolerances."""
         self.restore(self._initial)
+        self._extrapolation, self._failed = Extrapolation(), None
+        if self._solver is not None:
+            self._solver.begin_anew()

@@ -296,7 +296,10 @@ class WarmStart:
         self, body: Mechanics, stamp_ns: int, key: Key, moment: Moment, *, path_matters: bool
     ) -> tuple[SolvedMoment | None, bool]:
         """Return the same moment of an earlier run or of another mesh, or without memory of the path the solved moment
-        with the nearest pose; and whether it is the same."""
+        with the nearest pose; and whether it is the same. None where the probe and the support both rub: from
+        another run's solution the limits of the two settle sooner, but within their tolerance elsewhere."""
+        if body.memory.rubs and body.memory.slips:
+            return None, False
         if not key[0]:
             return self._known.get(key), True
         same = self._known.get(key) or self._from_elsewhere(stamp_ns, moment)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Generator, Iterable, Iterator
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from typing import Protocol
 
 import numpy as np
 
@@ -18,9 +19,26 @@ LONGEST_PATH_STEP = 5e-4  # m that a probe that rubs or sticks moves at a time
 MOST_PATH_STEPS = 20  # per prediction: a probe that comes from far need not crawl
 CLOSE_NS = 50_000  # a step of time shorter than that is not made for when a load begins to pull
 LEVER = 0.02  # m, about the size of a probe's face
+LONGER = 1.3  # than the one before, a step of a body that relaxes at rest: its stress fades ever more slowly
+MOST_FADING_STEPS = 8  # per gap: the first is a twentieth of it, and what fades sooner is over at its end
 
 PoseAt = Callable[[float], Array | None]  # stamp ns -> T_phantom_probe (4, 4)
-Pace = Callable[[], float]  # how long (s) the next dynamic step may be; asked when the one before is done
+
+
+class Passing(Protocol):
+    """A body that passes the instants, and says of the next step how it is to be, each time as it is when asked."""
+
+    def pace(self) -> float:
+        """Return how long (s) a step with inertia may be."""
+        ...
+
+    def pace_at_rest(self) -> float:
+        """Return how long (s) a step without inertia may be; inf: as long as one likes."""
+        ...
+
+    def swings_for(self) -> float:
+        """Return how long (s) a swing lasts."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -40,10 +58,10 @@ class Instant:
 @dataclass(frozen=True)
 class Timeline:
     """``start_ns``: of the recording, from which the release counts; ``clock_ns``: where the drifts' time is 0;
-    ``dynamic``: steps are short enough for inertia (but only over the last while before a stamp); ``hung``: the body
-    hung under its loads before it was held, and has not forgotten it; ``delays`` s after the release at which loads
-    begin to pull, of every physics that passes the same instants: a step of time ends there, as what it does in the
-    middle of one is not known as exactly."""
+    ``dynamic``: steps are short enough for inertia (but only over the last while before a stamp, as long as a swing
+    lasts); ``hung``: the body hung under its loads before it was held, and has not forgotten it; ``delays`` s after the
+    release at which loads begin to pull, of every physics that passes the same instants: a step of time ends there, as
+    what it does in the middle of one is not known as exactly."""
 
     start_ns: int
     clock_ns: int
@@ -78,9 +96,9 @@ class Timeline:
             return []
         return sorted({self.release_ns + round(1e9 * delay) for delay in self.delays if delay > 0.0})
 
-    def instants(self, now_ns: int | None, stamp_ns: int, pace: Pace) -> Iterator[Instant]:
-        """Yield what is passed from ``now_ns`` (None: from nothing) to ``stamp_ns``: each must be passed before the
-        next is asked for. A stamp that goes back takes no time."""
+    def instants(self, now_ns: int | None, stamp_ns: int, body: Passing) -> Iterator[Instant]:
+        """Yield what the ``body`` passes from ``now_ns`` (None: from nothing) to ``stamp_ns``: each must be passed
+        before the next is asked for. A stamp that goes back takes no time."""
         release_ns = self.release_ns
         if self.hung and (now_ns is None or not self.acts(now_ns)):
             now_ns = yield from self._held(now_ns, stamp_ns)
@@ -92,11 +110,11 @@ class Timeline:
             if self.dynamic:  # the probe may be there from the start: put in place without a blow
                 yield Instant(now_ns, 0.0, self.acts(now_ns))
         if self.acts(stamp_ns) and not self.acts(now_ns):
-            yield Instant(release_ns, 1e-9 * (release_ns - now_ns), active=False)  # it finds the body at rest
+            yield from _fading(now_ns, release_ns, body, active=False)  # it finds the body at rest
             if not self.dynamic:
                 yield Instant(release_ns, 0.0, active=True)
             now_ns = release_ns
-        yield from self._steps(now_ns, stamp_ns, pace, active=self.acts(stamp_ns))
+        yield from self._steps(now_ns, stamp_ns, body, active=self.acts(stamp_ns))
 
     def _held(self, now_ns: int | None, stamp_ns: int) -> Generator[Instant, None, int]:
         """Yield how the body rests, hangs, is lifted and held as it rested, to the release or the ``stamp_ns`` before;
@@ -113,32 +131,33 @@ class Timeline:
             yield Instant(then_ns, 0.0, active=True)
         return then_ns
 
-    def _steps(self, now_ns: int, stamp_ns: int, pace: Pace, *, active: bool) -> Iterator[Instant]:
+    def _steps(self, now_ns: int, stamp_ns: int, body: Passing, *, active: bool) -> Iterator[Instant]:
         if not self.dynamic:
-            yield from self._at_rest(now_ns, stamp_ns, active=active)
+            yield from self._at_rest(now_ns, stamp_ns, body, active=active)
             return
-        follow_ns = stamp_ns - round(1e9 * MEMORY)
-        if now_ns < follow_ns:
-            yield from self._at_rest(now_ns, follow_ns, active=active)
+        gap = 1e-9 * (stamp_ns - now_ns)
+        if gap > MEMORY and gap > (lasts := max(MEMORY, body.swings_for())):
+            follow_ns = stamp_ns - round(1e9 * lasts)
+            yield from self._at_rest(now_ns, follow_ns, body, active=active)
             now_ns = follow_ns
         while now_ns < stamp_ns:
             ahead = [o for o in self._onsets if now_ns + CLOSE_NS < o < stamp_ns - CLOSE_NS]
             left = min(ahead, default=stamp_ns) - now_ns
-            step = round(left / np.ceil(1e-9 * left / pace()))
+            step = round(left / np.ceil(1e-9 * left / body.pace()))
             now_ns += step
             yield Instant(now_ns, 1e-9 * step, active, still=False)
 
-    def _at_rest(self, now_ns: int, stamp_ns: int, *, active: bool) -> Iterator[Instant]:
-        """Yield one step of a body without inertia to ``stamp_ns``, cut where loads begin to pull: they do so at once,
-        as at the release, while a step knows only what changes evenly from its beginning to its end."""
+    def _at_rest(self, now_ns: int, stamp_ns: int, body: Passing, *, active: bool) -> Iterator[Instant]:
+        """Yield steps of a body without inertia to ``stamp_ns``, cut where loads begin to pull: they do so at once, as
+        at the release, while a step knows only what changes evenly from its beginning to its end."""
         for onset in self._onsets:
             if not now_ns <= onset <= stamp_ns:
                 continue
             if now_ns < onset - 1:  # a nanosecond on either side: the delays themselves are not round
-                yield Instant(onset - 1, 1e-9 * (onset - 1 - now_ns), active)
+                yield from _fading(now_ns, onset - 1, body, active=active)
             now_ns = min(onset + 1, stamp_ns)
             yield Instant(now_ns, 0.0, active)
-        yield Instant(stamp_ns, 1e-9 * max(stamp_ns - now_ns, 0), active)
+        yield from _fading(now_ns, stamp_ns, body, active=active)
 
     def in_path_steps(
         self,
@@ -189,6 +208,19 @@ def probe_pose(probe: Probe | None, pose_at: PoseAt | None, stamp_ns: int) -> Ar
     T = T.copy()
     T[:3, 3] += T[:3, :3] @ probe.offset
     return T
+
+
+def _fading(now_ns: int, stamp_ns: int, body: Passing, *, active: bool) -> Iterator[Instant]:
+    """Yield steps without inertia from ``now_ns`` to ``stamp_ns``, each longer than the one before, of which the first
+    is about as long as the body allows: its stress does not change evenly over a long one."""
+    gap = 1e-9 * max(stamp_ns - now_ns, 0)
+    first, n = body.pace_at_rest(), 1
+    while n < MOST_FADING_STEPS and first * (LONGER**n - 1.0) / (LONGER - 1.0) < gap:
+        n += 1
+    shares = (LONGER ** np.arange(1, n) - 1.0) / (LONGER**n - 1.0)
+    ends = [*(now_ns + round(1e9 * gap * share) for share in shares), stamp_ns]
+    for before, end in pairwise([now_ns, *ends]):
+        yield Instant(end, 1e-9 * max(end - before, 0), active)
 
 
 def _steps_of(start: Array | None, end: Array | None, longest: float) -> int:

@@ -13,6 +13,7 @@ from functools import partial
 
 from livedeform.common.errors import ConvergenceError
 from livedeform.common.types import Array
+from livedeform.fem_node.contact.contact import EXACT
 from livedeform.fem_node.items.protocol import Moment
 from livedeform.fem_node.path.direction import Direction, Sensitivities
 from livedeform.fem_node.path.followers import Followers
@@ -89,7 +90,7 @@ class Walk:
 
         Without an equilibrium somewhere on the way everything is as before, and `ConvergenceError` is raised.
         """
-        n = self.through(self.line.instants(self.now_ns, stamp_ns, self.body.pace), stamp_ns, wanted)
+        n = self.through(self.line.instants(self.now_ns, stamp_ns, self.body), stamp_ns, wanted)
         self.now_ns = stamp_ns
         self._passed[stamp_ns] = self._here(stamp_ns)
         return n
@@ -136,7 +137,8 @@ class Walk:
             self._begun, self._active = True, instant.active
             return 0
         if body.contact is not None and body.memory.rubs:
-            body.contact.exactness = 1.0 if instant.stamp_ns == stamp_ns else self.walk_settings.between
+            # each step goes on from where the last one ended, so that what was left open adds up to another path
+            body.contact.exactness = EXACT * (1.0 if instant.stamp_ns == stamp_ns else self.walk_settings.between)
         warm = None if body.memory.rings else self.warm
         key = None if warm is None or passing else warm.key(instant.stamp_ns, moment, first=not self._begun)
         known = None if warm is None or key is None else warm.solved(body, key, moment)

@@ -105,6 +105,11 @@ class CondensedSearch:
         """Let the next search begin with a fresh factor."""
         self._compliance = None
 
+    def begin_anew(self) -> None:
+        """Forget the last factor, and onto which surface it was condensed."""
+        self.forget()
+        self._linear.cover(np.zeros(0, np.int64))
+
     # -- steps -----------------------------------------------------------------------------------------------------
 
     def _search(self, x: Array, tolerance: float, size: float) -> Array:
@@ -120,9 +125,11 @@ class CondensedSearch:
             x, whole = self._along(x, step * min(1.0, most / max(length, most)))
             whole &= length <= most
             before = length
-            if whole and length < tolerance and not any([item.update(x) for item in self.others]):
-                if not self.contact.let_go(x):
+            if whole and length < tolerance:
+                moved = any([item.update(x) for item in self.others])  # every item is asked
+                if not moved and not self.contact.let_go(x):
                     return x
+                self._evaluate(x)  # what was in balance with the limits before is not with those now
                 before = last = np.inf  # the body jumps
                 continue
             if length > SLOW * last or not whole:

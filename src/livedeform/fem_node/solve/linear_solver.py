@@ -69,6 +69,10 @@ class Factor(Protocol):
 class LinearSolver(Factor, Protocol):
     """A kept factorisation of the tangent."""
 
+    def begin_anew(self) -> None:
+        """Forget which tangents came before."""
+        ...
+
     def factorise(self, system: System) -> None:
         """Factorise the system's values; `FactorisationError` if that cannot be."""
         ...
@@ -129,6 +133,9 @@ class Pardiso:
         self._values: Array = np.zeros(pattern.nnz, self._type)
         self._finalizer = weakref.finalize(self, _give_back, self._handle, pattern, kind)
 
+    def begin_anew(self) -> None:
+        """See `LinearSolver`: no factor depends on the one before."""
+
     def factorise(self, system: System) -> None:
         self._values[:] = system.values
         if not np.all(np.isfinite(self._values)):
@@ -167,6 +174,10 @@ class SinglePrecision:
         signs = np.random.default_rng(0).integers(0, 2, pattern.n_dof)
         # (n,) a solution that tells how exact the factor is
         self._known: Array = np.asarray(2.0 * signs - 1.0, np.float64)
+
+    def begin_anew(self) -> None:
+        """See `LinearSolver`: single precision is tried again."""
+        self._failures = 0
 
     def factorise(self, system: System) -> None:
         self._factor = self._single
@@ -376,6 +387,9 @@ class SuperLU:
     def __init__(self, pattern: Pattern) -> None:
         self.pattern = pattern
         self._factor: Any = None
+
+    def begin_anew(self) -> None:
+        """See `LinearSolver`: no factor depends on the one before."""
 
     def factorise(self, system: System) -> None:
         self._factor = None

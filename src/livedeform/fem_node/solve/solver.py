@@ -134,6 +134,17 @@ class Solver:
 
     # -- one moment ------------------------------------------------------------------------------------------------
 
+    def begin_anew(self) -> None:
+        """Forget factors and what earlier moments took: a run is then the same to the last bit, whatever the solver
+        has solved before. What is known of the matrix's pattern stays."""
+        self.has_factor = False
+        self.learned.clear()
+        self.linear.begin_anew()
+        if self._condensed is not None:
+            self._condensed.begin_anew()
+        self._usual = self._failed = Work(0.0, 0.0)
+        self._gave_up = False
+
     def begin(self) -> None:
         """Begin with the first start of a moment."""
         self._failed = Work(0.0, 0.0)
