@@ -1,4 +1,4 @@
-"""The point of two pictures, of rays that meet or miss each other, with its covariance and chi-square."""
+"""Find the point of two pictures, whose rays meet or miss each other, its covariance as triangulated, and chi2."""
 
 from __future__ import annotations
 
